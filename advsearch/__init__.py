@@ -13,7 +13,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from advsearch.rooms import made_question, made_questions
+from advsearch.registry import made_question, made_questions
 
 __version__ = "0.1.0"
 

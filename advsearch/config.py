@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import JsonValue, field_validator, model_validator
 
-from advsearch import rooms
+from advsearch import registry
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import MESHES, either
 from advsearch.options import JOINED, by_key, things_as_text
@@ -532,15 +532,15 @@ FIRST = ("attack", "render", "sweep")  # the commands that the docs show first
 
 class _Configs(Mapping[str, type[Config]]):
     def __iter__(self) -> Iterator[str]:
-        there = [name for name in FIRST if name in ("render", *rooms.rooms())]
-        others = (name for name in rooms.rooms() if name not in FIRST)
-        return iter((*there, *(name for name in others if rooms.Room(name).config is not None)))
+        there = [name for name in FIRST if name in ("render", *registry.rooms())]
+        others = (name for name in registry.rooms() if name not in FIRST)
+        return iter((*there, *(name for name in others if registry.Room(name).config is not None)))
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
     def __getitem__(self, name: str) -> type[Config]:
-        config: type[Config] | None = RenderConfig if name == "render" else getattr(rooms.room(name), "config", None)
+        config: type[Config] | None = RenderConfig if name == "render" else getattr(registry.room(name), "config", None)
         if config is None:
             raise KeyError(name)
         return config

@@ -5,7 +5,7 @@
 
 Those of logits are **maximised**. Each takes logits (N, C) and labels: (N,) int64, or the indices of a label set of
 which every label is right; each is an objective by itself. Those of colours are a **cost**. All return (N,) and are
-differentiable; formulas are in `advsearch.attacks.objective_functions` and `advsearch.engine.objective`.
+differentiable; formulas are in `advsearch.attacks.objective_functions` and `advsearch.engine.judging`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import objective_functions as of_logits
-from advsearch.engine import objective
+from advsearch.engine import judging
 from advsearch.errors import InputError
 
 __all__ = [
@@ -98,7 +98,7 @@ def total_variation(colors: Tensor) -> Tensor:
         colors: (N, h, w, 3) sRGB in [0, 1], a texture or pictures; or (N, h, w, 4), of which only pixels with a last
             channel over 0 count.
     """
-    return torch.stack([objective.variation(one) for one in _pictures(colors)])
+    return torch.stack([judging.variation(one) for one in _pictures(colors)])
 
 
 def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
@@ -111,7 +111,7 @@ def non_printability(colors: Tensor, palette: Tensor | None = None) -> Tensor:
         colors: as for `total_variation`.
         palette: (P, 3) sRGB in [0, 1], the colours that can be printed; None for the 125 of `printable`.
     """
-    return torch.stack([objective.off_print(one, palette) for one in _pictures(colors)])
+    return torch.stack([judging.off_print(one, palette) for one in _pictures(colors)])
 
 
 nps = non_printability  # its usual short name

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from advsearch import models
 from advsearch.engine import loading
-from advsearch.engine.objective import domain_of
+from advsearch.engine.judging import domain_of
 from advsearch.errors import InputError
 from advsearch.models.labels import find_label_set
 from advsearch.scene.formation import to_8_bit

@@ -3,7 +3,7 @@
     @question("gap --object mug --control pose", place=("object", "model"))
     def gap(asked: Asked[GapConfig]) -> GapResult: ...
 
-`advsearch.rooms` finds it by its name. The first line of its file says what it does, as `advsearch --help` shows it.
+`advsearch.registry` finds it by its name. The first line of its file says what it does, as `advsearch --help` shows it.
 The file imports nothing that renders but inside the function: who reads settings or a result reads it too.
 """
 
@@ -19,11 +19,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_args, get_type_hints
 
-from advsearch import rooms
+from advsearch import registry
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, watcher
-from advsearch.report.markup import result_figure
-from advsearch.report.shown import shown
+from advsearch.report.shown import result_figure, shown
 from advsearch.runs.directory import RunDirectory, begun
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results import INTERRUPTED, Result
@@ -113,7 +112,7 @@ def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path
     check_names(config)
     keeps_run = resumed is None and getattr(config, "out", None) is None
     with begun(config) if keeps_run else nullcontext(resumed) as folder:  # before what is heavy is imported
-        room = rooms.room(config.command)
+        room = registry.room(config.command)
         ask = room.from_config if room else None
         if ask is None:
             ask = getattr(import_module(f"advsearch.api.{config.command}"), f"{config.command}_from_config")
@@ -199,7 +198,7 @@ def question(
         place: settings that Python takes by position.
         about: the setting that names a run or a file which it is about.
         expected: where that is given without its flag, what stands for it in the help, and what an error says it is;
-            as further fields of `cli.commands.Positional`, what the help adds, and whether there may be several.
+            as further fields of `cli.main.Positional`, what the help adds, and whether there may be several.
         brought: returns settings that the `run.yaml` of that run brings, by what was typed.
         called: ``module:function`` that Python calls, where more can be given there than settings.
         more: what its help says after what it does.

@@ -4,7 +4,7 @@ weighted relative accuracy (Lavrac, Flach and Zupan 1999), made shorter where th
 
 The rows are a *table*, a pandas frame: a column for each factor, float64 or a category of names in alphabetical order;
 `correct`, whether the model was right; and `unit`, of what draw a row is: rows of one unit are not independent
-(`runs.units`). ``attrs["units"]`` has the unit of each factor, so its keys are the factors.
+(`runs.tables.Units`). ``attrs["units"]`` has the unit of each factor, so its keys are the factors.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from advsearch.attacks.units import mean_interval, share_interval
 from advsearch.cli.main import main as advsearch
 from advsearch.report.wording import interval_text, number_text, percent
 from advsearch.runs.store import Row, Store
-from advsearch.runs.units import units_of
+from advsearch.runs.tables import units_of
 
 Interval = tuple[float, float]
 RUNS = ("weather", "rules", "drive", "paint", "beside", "clean-and-paint", "gate")

@@ -35,7 +35,7 @@ import transport  # noqa: E402
 import advsearch  # noqa: E402
 from advsearch.controls import make_control  # noqa: E402
 from advsearch.questions.attack.result import AttackResult  # noqa: E402
-from advsearch.runs.images import to_8bit  # noqa: E402
+from advsearch.runs.files import to_8bit  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 
 SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"), ("stop-sign", "avenue-dusk"), ("car", "street"))

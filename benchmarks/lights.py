@@ -25,7 +25,7 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.attacks.draws import Seeds  # noqa: E402
+from advsearch.attacks.domain import Seeds  # noqa: E402
 from advsearch.questions.sweep.carry_out import job_of  # noqa: E402
 from advsearch.questions.sweep.job import KIND, SweptScene  # noqa: E402
 from advsearch.questions.sweep.settings import SweepConfig  # noqa: E402

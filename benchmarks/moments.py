@@ -24,7 +24,7 @@ from advsearch.controls import compose  # noqa: E402
 from advsearch.controls.path import PathControl  # noqa: E402
 from advsearch.engine.loading import make_renderer  # noqa: E402
 from advsearch.scene.description import describe  # noqa: E402
-from advsearch.scene.moments import Moment, moments_of  # noqa: E402
+from advsearch.scene.formation import Moment, moments_of  # noqa: E402
 
 SECONDS, MIDDLE = 2.0, 0.9
 COUNTS, REFERENCE = (1, 2, 4, 8, 16, 32, 64), 512

@@ -30,7 +30,7 @@ from torch import Tensor  # noqa: E402
 
 import advsearch  # noqa: E402
 from advsearch import losses  # noqa: E402
-from advsearch.engine.objective import off_print, variation  # noqa: E402
+from advsearch.engine.judging import off_print, variation  # noqa: E402
 from advsearch.scene import gradients as plan  # noqa: E402
 
 ASKED = 1.05

@@ -34,7 +34,7 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult, make_policy
 from advsearch.attacks.candidates import Failures, FoundFailure
-from advsearch.attacks.rate_samples import choose_rate_spp
+from advsearch.attacks.trials import choose_rate_spp
 from advsearch.attacks.verification import OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.record import Findings, Stages

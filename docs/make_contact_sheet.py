@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 
 import advsearch
-from advsearch.runs.images import to_8bit
+from advsearch.runs.files import to_8bit
 
 OBJECTS = (".obj", ".ply", ".glb", ".gltf", ".stl")
 ENVIRONMENTS = (".hdr", ".exr")

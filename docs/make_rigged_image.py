@@ -20,7 +20,7 @@ from PIL import Image
 
 import advsearch
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.glb_buffer import GlbBuffer
+from advsearch.scene.glb import GlbBuffer
 
 PICTURE = Path(__file__).resolve().parent / "images" / "rigged.webp"
 JOINTS, BONE, ROUND = 4, 0.09, 32

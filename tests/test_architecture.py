@@ -34,7 +34,6 @@ COMMON = {
     "options",
     "pictures",
     "registry",
-    "rooms",
     "seeds",
     "threads",
     "progress",
@@ -232,7 +231,7 @@ def test_a_question_knows_another_only_by_what_carries_it_out_and_its_result() -
 def test_nothing_below_the_questions_imports_one_of_them() -> None:
     above, server = {"questions", "api", "cli", "testing", ""}, "advsearch.viewer.server"
     broken = [
-        f"{path.relative_to(ROOT)} imports {name}: find it by `advsearch.rooms`"
+        f"{path.relative_to(ROOT)} imports {name}: find it by `advsearch.registry`"
         for module, path in python_files()
         if room(module) not in above and module != server
         for name in imports(module, path)
@@ -359,7 +358,7 @@ SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
         "from advsearch.cli.main import main\n"
         "with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit): main(['--help'])\n"
         "assert 'attack' in text.getvalue()",
-        "from advsearch.rooms import Room, rooms\nassert [Room(name).result for name in rooms()]",
+        "from advsearch.registry import Room, rooms\nassert [Room(name).result for name in rooms()]",
     ],
     ids=["small modules", "rooms", "help", "questions"],
 )

@@ -47,15 +47,15 @@ from advsearch.questions.recipe.description import planned, read_recipe
 from advsearch.questions.recipe.description import recipe_names as recipes
 from advsearch.questions.recipe.result import RecipeConfig
 from advsearch.questions.replay.result import WAYS, ReplayConfig
-from advsearch.questions.stability.carry_out import chosen
 from advsearch.questions.stability.result import StabilityConfig
+from advsearch.questions.stability.scenes import chosen
 from advsearch.questions.sweep.axes import read_axes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig, read_suite
 from advsearch.runs import export
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
-from advsearch.scene import environments, library
+from advsearch.scene import library
 from advsearch.scene.importing.scenes import MITSUBA_FILE, split_node
 from advsearch.scene.rig import read_rig
 from advsearch.scene.settings import resolve
@@ -164,7 +164,7 @@ def check_names(config: Config) -> None:
         needs_label = not isinstance(config, (RenderConfig, HardenConfig)) and name not in library.list_objects()
         assert config.label is not None or not needs_label, "a file does not bring a label"
     for name in lights:
-        assert name in library.list_environments() or Path(name).suffix in environments.SUFFIXES
+        assert name in library.list_environments() or Path(name).suffix in library.SUFFIXES
     if isinstance(config, AttackConfig):
         as_controls(config.over)
         make_policy(config.policy_name, **config.policy_options)

@@ -17,13 +17,12 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.attacks import Query
 from advsearch.controls import CONTROLS, OWN, NumberControl, compose, make_control, make_space
+from advsearch.engine.judging import domain_of
 from advsearch.engine.loading import framed, make_renderer
-from advsearch.engine.objective import domain_of
 from advsearch.engine.problem import Problem
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.sweep.axes import on_grid, read_axes
-from advsearch.questions.sweep.points import Points
+from advsearch.questions.sweep.axes import Points, on_grid, read_axes
 from advsearch.runs.results import plain
 from advsearch.scene.description import describe
 from advsearch.scene.formation import to_8_bit

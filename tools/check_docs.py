@@ -22,11 +22,11 @@ from types import ModuleType
 import reference_scenes
 import torch
 
-from advsearch.attacks import POLICIES, candidates, clopper_pearson, planned_renders, rate_samples, trials, verification
+from advsearch.attacks import POLICIES, candidates, clopper_pearson, planned_renders, trials, verification
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cli.commands import COMMANDS
+from advsearch.cli.main import COMMANDS
 from advsearch.cli.show import REGISTRIES
 from advsearch.controls import CONTROLS, texture
 from advsearch.files import MESHES
@@ -42,7 +42,7 @@ from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test import counterexamples as tested
 from advsearch.runs import directory, export, store
 from advsearch.runs.results import RenderResult, Result
-from advsearch.scene import environments, exposure, library
+from advsearch.scene import formation, library
 from advsearch.scene.geometry import FRAME_FILL
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
@@ -169,7 +169,7 @@ def names() -> Iterator[str]:
         yield from absent("objectives.md", [f"| `{name}` |", f"--objective {name}"])
     bundled = [*SETTINGS, *library.list_objects(), *library.list_environments()]
     yield from absent("scenes.md", [f"| `{name}` |" for name in bundled])
-    yield from absent("scenes.md", [f"`{ending}`" for ending in (*MESHES, *environments.SUFFIXES)])
+    yield from absent("scenes.md", [f"`{ending}`" for ending in (*MESHES, *library.SUFFIXES)])
     options = set(inspect.signature(loading.load_model).parameters) - {"spec", "name", "max_batch"}
     text = page("models.md")
     yield from (
@@ -278,14 +278,14 @@ MADE_BY_HAND = [
     ("testing.md", f"*no worse by 5 points* {_draws(0.475, 0.5)} where both models predict alike"),
     ("testing.md", "in all {} trials ({} for one".format(*(tested.TRIALS[over] for over in (False, True)))),
     ("testing.md", f"6 of 6 show a share of at least {100 * clopper_pearson(6, 6)[0]:.0f} %"),
-    ("design.md", f"are rendered under {rate_samples.CONDITIONS} conditions at 4, 16 and 64 samples"),
-    ("design.md", f"carry at most {100 * rate_samples.MOVED:.0f} % of the conditions over zero"),
+    ("design.md", f"are rendered under {trials.CONDITIONS} conditions at 4, 16 and 64 samples"),
+    ("design.md", f"carry at most {100 * trials.MOVED:.0f} % of the conditions over zero"),
     ("runs.md", {1.0: "may lose the rows of the last second"}[store.SYNC_INTERVAL]),
     ("runs.md", f"more than {100 * store.SYNC_SHARE:.0f} % of the time"),
     ("scenes.md", f"reaches to {100 * FRAME_FILL:.0f} % of the way"),
-    ("scenes.md", f"gets the linear value {exposure.METERED_WHITE}"),
+    ("scenes.md", f"gets the linear value {formation.METERED_WHITE}"),
     ("scenes.md", f"averaged down to at most {TEXTURE_LIMIT} texels"),
-    ("scenes.md", "Maps larger than {1} x {0} are".format(*environments.LARGEST)),
+    ("scenes.md", "Maps larger than {1} x {0} are".format(*library.LARGEST)),
     ("controls/texture.md", f"Default {texture.DEFAULT_EPSILON}"),
     ("controls/texture.md", "at least {} and at most {}".format(*texture.RESOLUTIONS)),
     ("policies/pgd.md", f"the first after {100 * pgd.FIRST_WINDOW:.0f} % of the steps"),

@@ -242,7 +242,7 @@ FAULTS = (
     ),
     Fault(
         "report: a page escapes nothing",
-        "advsearch/report/markup.py",
+        "advsearch/report/shown.py",
         "part if isinstance(part, Html) else escape(part)",
         "part",
         ("tests/viewer/test_attack_page.py",),

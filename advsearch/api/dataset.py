@@ -33,8 +33,7 @@ from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, only_here
-from advsearch.runs.files import placed_by, storage_errors, write_text
-from advsearch.runs.images import write_png
+from advsearch.runs.files import placed_by, storage_errors, write_png, write_text
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.scene.assets import Bools
 from advsearch.scene.description import OBJECT

@@ -34,7 +34,7 @@ from advsearch.questions.sweep.result import SweepResult
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.registry import allow_named, names_code
 from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
-from advsearch.runs.images import read_png
+from advsearch.runs.files import read_png
 from advsearch.runs.results import RenderResult, Result
 from advsearch.runs.summary import read_configuration, read_result
 from advsearch.scene.importing.files import LARGEST_FILE

@@ -6,8 +6,7 @@ import argparse
 from typing import Any
 
 from advsearch.cli import output
-from advsearch.cli.commands import COMMANDS, PlainCommand, argument
-from advsearch.cli.main import add_command, without_commands
+from advsearch.cli.main import COMMANDS, PlainCommand, add_command, argument, without_commands
 from advsearch.cli.show import REGISTRIES, list_names
 from advsearch.errors import InputError
 

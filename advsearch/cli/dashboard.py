@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.commands import PlainCommand, argument
+from advsearch.cli.main import PlainCommand, argument
 from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
 from advsearch.runs.directory import find_run

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from advsearch import __version__, threads
 from advsearch.cli import output
-from advsearch.cli.commands import PlainCommand
+from advsearch.cli.main import PlainCommand
 from advsearch.errors import AdvsearchError
 from advsearch.registry import OWN_FOLDER
 from advsearch.scene.mitsuba_backend import llvm

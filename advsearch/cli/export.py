@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from advsearch.cli import output
-from advsearch.cli.commands import PlainCommand, argument
+from advsearch.cli.main import PlainCommand, argument
 from advsearch.cli.output import at_work, output_errors
 from advsearch.described import rounded
 from advsearch.errors import InputError, UnknownNameError
@@ -56,8 +56,7 @@ def _dataset(args: argparse.Namespace, out: Path, format: str) -> Written:
 def _scene(args: argparse.Namespace, out: Path, format: str) -> Written:
     with at_work(as_json=True, quiet=False):
         # take seconds
-        from advsearch.api.export import write_gltf, write_mitsuba
-        from advsearch.api.projection import write_projection
+        from advsearch.api.export import write_gltf, write_mitsuba, write_projection
 
         write, begin, between = {
             "gltf": (write_gltf, f"The object is in {out}.", " "),

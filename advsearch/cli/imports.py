@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import advsearch
 from advsearch.cli import output
-from advsearch.cli.commands import PlainCommand, argument
+from advsearch.cli.main import PlainCommand, argument
 from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either

@@ -8,9 +8,9 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from advsearch.cli import commands, output
-from advsearch.cli.commands import PlainCommand, argument
+from advsearch.cli import main, output
 from advsearch.cli.flags import command_in, config_of_file
+from advsearch.cli.main import PlainCommand, argument
 from advsearch.cli.show import show_run
 from advsearch.errors import InputError
 from advsearch.registry import allow_named
@@ -50,7 +50,7 @@ def run_file(
             raise InputError(f"{file}: {setting.name}: {setting.does}, which a file can't ask for; type {setting.ask}")
         if not args.quiet:
             print(f"advsearch: {setting.name} is left out: it {setting.does}; type {setting.ask}", file=sys.stderr)
-    command = commands.command_named(config.command)
+    command = main.command_named(config.command)
     return int(command.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
 
 

@@ -14,16 +14,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advsearch.cli import commands, output
-from advsearch.cli.commands import PlainCommand, QuestionCommand, argument
+from advsearch.cli import main, output
 from advsearch.cli.flags import add_settings
+from advsearch.cli.main import PlainCommand, QuestionCommand, argument
 from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
-from advsearch.registry import allow_named
+from advsearch.registry import allow_named, there
 from advsearch.report.wording import SEEN, count, interval_text, seen_cells, seen_text, things_rows
-from advsearch.rooms import there
 from advsearch.runs.directory import IMAGES, find_run
 from advsearch.runs.listing import Listed, listed_run
 from advsearch.runs.results import RenderResult, plain
@@ -66,7 +65,7 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     if not (path / NAME).is_file():
         return _show_unfinished(listed_run(path), as_json)
     result = read_result(path)
-    text = commands.command_named(result.command).text
+    text = main.command_named(result.command).text
     photos = photos_of(path)
     if as_json:
         output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)
@@ -306,7 +305,7 @@ _EVERY = {
     "objectives": "advsearch.attacks.objectives:objective_summaries",
     "models": "advsearch.cli.show:MODELS",
     "recipes": "advsearch.questions.recipe.description:titles",
-    CASES: "advsearch.questions.stability.carry_out:sentences",
+    CASES: "advsearch.questions.stability.scenes:sentences",
 }
 REGISTRIES = {kind: place for kind, place in _EVERY.items() if there(place)}
 """Where the names of each kind are: a mapping from them, or a function that returns them."""

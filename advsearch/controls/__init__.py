@@ -11,10 +11,9 @@ from importlib import import_module
 from pkgutil import iter_modules
 from typing import Any
 
-from advsearch.controls.base import Budget, Choice, Control, Group, Parameter
+from advsearch.controls.base import Budget, Choice, Control, Group, Moved, Parameter, check_prepared
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.space import Space
-from advsearch.controls.values import Moved, check_prepared
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import by_key
 from advsearch.registry import Registry

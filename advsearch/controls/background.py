@@ -15,9 +15,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, Value, measure, number
+from advsearch.controls.base import Choice, Fixed, Number, OneOf, Parameter, Value, measure, number
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription

@@ -6,10 +6,9 @@ from collections.abc import Iterable, Mapping
 
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.base import Choice, Number, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.ranges import is_number
-from advsearch.controls.values import Number
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import MeshRig
 from advsearch.scene.people import PARAMETERS

@@ -16,16 +16,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Parameter, number
+from advsearch.controls.base import Fixed, Parameter, number
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed
 from advsearch.errors import InputError
+from advsearch.scene.assets import on_roads
+from advsearch.scene.camera_entries import PRESETS
 from advsearch.scene.camera_model import COEFFICIENTS, NUMBERS, OF_KIND, CameraModel, pinhole
-from advsearch.scene.camera_presets import PRESETS
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import STEEPEST, affine, camera_to_world, framing_distance, middle
 from advsearch.scene.settings import CAMERA, ORBIT, ORBIT_CAMERA, moving
-from advsearch.scene.sizes import on_roads
 
 ROAD_USERS = (0.5, 4.0)  # metres above the road from which vehicles are seen: from a bumper to the roof of a lorry
 SENSOR_WIDTH = 36.0  # width in millimetres of the full-frame sensor that a focal length refers to

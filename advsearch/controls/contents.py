@@ -20,11 +20,10 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, Parameter, Value, measure, number
+from advsearch.controls.base import NOTHING, Fixed, Number, OneOf, Parameter, Spec, Value, measure, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.ranges import Range
 from advsearch.controls.shadow import polygon
-from advsearch.controls.values import Fixed, Number, OneOf, Spec
 from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, Ints, Material, Mesh, ObjectAsset
 from advsearch.scene.color import srgb_to_linear

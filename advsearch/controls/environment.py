@@ -19,16 +19,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter, number
+from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Fixed, Number, Parameter, number
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, Number
 from advsearch.errors import InputError
 from advsearch.scene import library, settings
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription, is_path
-from advsearch.scene.environments import import_environment
-from advsearch.scene.exposure import metered_gain
+from advsearch.scene.formation import metered_gain
 from advsearch.scene.geometry import real_harmonics
+from advsearch.scene.library import import_environment
 from advsearch.scene.settings import CHANNELS, LIT
 
 COEFFICIENTS = 27  # degrees 0 to 2 of three colour channels

@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Parameter, number
+from advsearch.controls.base import Number, Parameter, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.ranges import Range
-from advsearch.controls.values import Number
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world

@@ -14,9 +14,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, number
+from advsearch.controls.base import Choice, OneOf, Parameter, number
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import OneOf
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.settings import CHANNELS
 

@@ -17,13 +17,12 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, number
+from advsearch.controls.base import Choice, Fixed, Number, Parameter, number
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, Number
 from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.exposure import WHITE, metered_gain
+from advsearch.scene.formation import WHITE, metered_gain
 from advsearch.scene.geometry import affine
 from advsearch.scene.parts import BallLamp, PointLamp
 from advsearch.scene.settings import CHANNELS, LIT, colors, moving

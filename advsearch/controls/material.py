@@ -8,21 +8,382 @@ A named material has a seamless pattern and numbers of its own, as in 3DB (Lecle
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import lru_cache
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache, lru_cache
 
+import numpy as np
+import numpy.typing as npt
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
-from advsearch.controls.base import Parameter
-from advsearch.controls.material_patterns import PATTERNS, covering
+from advsearch.controls.base import Number, Parameter
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Number
 from advsearch.errors import InputError
-from advsearch.scene.assets import Material, Mesh
+from advsearch.scene.assets import Doubles, Floats, Material, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.raster import looked_up, texel_positions
 from advsearch.scene.settings import CHANNELS, MATERIAL, colors
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Named materials made by procedure: seamless patterns with a surface of their own, and how they cover an object.
+#
+# Each is a square tile that repeats without a visible seam (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4),
+# made of periodic gradient noise (Perlin 1985), cells (Worley 1996), and iterated band-pass filtering (Turing 1952;
+# Young 1984).
+
+Grid = tuple[Doubles, Doubles]
+"""Coordinates x (to the right) and y (down) of texel centres, each (SIDE, SIDE) in (0, 1)."""
+
+SIDE = 512  # side of a tile in texels
+BLEND = 20.0  # power of the normal's components that weighs the three projections of a tile: how sharply they meet
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A named material: the side of a tile in object sizes, the surface beside its colour, and what draws the tile at
+    texels (`Grid`): (SIDE, SIDE, 3) display-referred sRGB, any overshoot clipped later."""
+
+    name: str
+    size: float
+    material: Material
+    paint: Callable[[Grid], Doubles]
+
+
+PATTERNS: dict[str, Pattern] = {}
+"""Every named material by its name."""
+
+
+def pattern(size: float, **surface: float) -> Callable[[Callable[[Grid], Doubles]], None]:
+    """Make a named material of the function below; see `Pattern`."""
+
+    def register(paint: Callable[[Grid], Doubles]) -> None:
+        PATTERNS[paint.__name__] = Pattern(paint.__name__, size, Material(**surface), paint)
+
+    return register
+
+
+# ---- ingredients: everything repeats after 1 in x and y --------------------------------------------------------------
+
+
+def _noise(at: Grid, cells: tuple[int, int], seed: int) -> Doubles:
+    """Gradient noise with a whole number of lattice cells across the tile; about -1 to 1, mean 0."""
+    across, down = cells
+    angle = np.random.Generator(np.random.PCG64(seed)).uniform(0.0, 2.0 * np.pi, (down, across))
+    x, y = at[0] * across, at[1] * down
+    left, top = np.floor(x), np.floor(y)
+    fx, fy = x - left, y - top
+    column, row = left.astype(np.int64), top.astype(np.int64)
+
+    def corner(right: int, below: int) -> Doubles:
+        turn = angle[(row + below) % down, (column + right) % across]
+        return np.asarray(np.cos(turn) * (fx - right) + np.sin(turn) * (fy - below))
+
+    wx, wy = (f * f * f * (f * (f * 6.0 - 15.0) + 10.0) for f in (fx, fy))
+    upper = corner(0, 0) * (1.0 - wx) + corner(1, 0) * wx
+    lower = corner(0, 1) * (1.0 - wx) + corner(1, 1) * wx
+    return np.asarray((upper * (1.0 - wy) + lower * wy) * 1.5)
+
+
+def _clouds(at: Grid, cells: tuple[int, int], octaves: int, seed: int) -> Doubles:
+    """Octaves of noise, each twice as fine and half as strong; about -1 to 1."""
+    total = np.zeros_like(at[0])
+    for octave in range(octaves):
+        total += 0.5**octave * _noise(at, (cells[0] << octave, cells[1] << octave), seed + 101 * octave)
+    return total / (2.0 - 0.5 ** (octaves - 1))
+
+
+def _warped(at: Grid, cells: int, amount: float, seed: int) -> Grid:
+    """Move the coordinates about by noise."""
+    across = _clouds(at, (cells, cells), 2, seed)
+    down = _clouds(at, (cells, cells), 2, seed + 7)
+    return at[0] + amount * across, at[1] + amount * down
+
+
+def _scattered(count: int, seed: int) -> Doubles:
+    """Points of a torus about as far from each other as they can be, irregular: (count, 2) in [0, 1). Best candidate
+    sampling (Mitchell 1991): each point is the farthest from those before it of a few random ones."""
+    generator = np.random.Generator(np.random.PCG64(seed))
+    points = generator.random((1, 2))
+    while len(points) < count:
+        candidates = generator.random((16, 2))
+        gap = np.abs(candidates[:, None] - points[None])
+        gap = np.minimum(gap, 1.0 - gap)
+        points = np.concatenate([points, candidates[[np.argmax((gap**2).sum(-1).min(1))]]])
+    return np.asarray(points)
+
+
+def _cells(at: Grid, points: Doubles, count: int = 2) -> tuple[Doubles, npt.NDArray[np.int64]]:
+    """Distances (SIDE, SIDE, count) to the nearest points on the torus, nearest first, and which points they are."""
+    place = np.stack([at[0] % 1.0, at[1] % 1.0], axis=-1)
+    distance, index = cKDTree(points, boxsize=1.0).query(np.minimum(place, np.nextafter(1.0, 0.0)), k=count)
+    return np.asarray(distance), np.asarray(index, dtype=np.int64)
+
+
+def _turing(wavelength: tuple[float, float], bias: float, seed: int, rounds: int = 12) -> Doubles:
+    """Animal stripes or spots in [-1, 1]: noise, band-passed and saturated again and again; after about ten rounds the
+    pattern has settled. Wavelengths are in tiles, along x and along y; unequal ones make stripes across the shorter.
+    The bias is added before saturation: stripes break up into spots away from 0."""
+    frequency = np.fft.fftfreq(SIDE, 1.0 / SIDE)
+    radius = np.hypot(frequency[None, :] * wavelength[0], frequency[:, None] * wavelength[1])
+    band = np.exp(-(((radius - 1.0) / 0.22) ** 2))
+    field = np.random.Generator(np.random.PCG64(seed)).standard_normal((SIDE, SIDE))
+    for _ in range(rounds):
+        field = np.fft.ifft2(np.fft.fft2(field) * band).real
+        field = np.tanh(2.5 * field / field.std() + bias)
+    return np.asarray(field)
+
+
+def _step(value: Doubles, edge: float, soft: float) -> Doubles:
+    """0 below the edge, 1 above it, with a smooth ramp `soft` wide."""
+    share = np.clip((value - edge) / soft + 0.5, 0.0, 1.0)
+    return np.asarray(share * share * (3.0 - 2.0 * share))
+
+
+def _color(code: str) -> Doubles:
+    return np.array([int(code[i : i + 2], 16) / 255.0 for i in (0, 2, 4)])
+
+
+def _mix(first: Doubles, second: Doubles, share: Doubles) -> Doubles:
+    """From the first colour to the second; colours (3,) or (SIDE, SIDE, 3), shares (SIDE, SIDE)."""
+    return np.asarray(first + (second - first) * share[..., None])
+
+
+def _ramp(value: Doubles, *codes: str) -> Doubles:
+    """Colours evenly spaced over values from 0 to 1."""
+    colors = np.stack([_color(code) for code in codes])
+    stops = np.linspace(0.0, 1.0, len(codes))
+    return np.stack([np.interp(value, stops, colors[:, channel]) for channel in range(3)], axis=-1)
+
+
+# ---- the patterns ----------------------------------------------------------------------------------------------------
+
+
+@pattern(1.0, roughness=0.5)
+def plain(at: Grid) -> Doubles:
+    return np.ones((SIDE, SIDE, 3))
+
+
+@pattern(0.6, roughness=0.45)
+def wood(at: Grid) -> Doubles:
+    x, y = at
+    bend = 0.16 * _clouds(at, (2, 1), 2, 11) + 0.012 * _noise(at, (8, 3), 12)
+    rings = 9.0 * (x + bend) + 0.25 * _noise(at, (5, 2), 17)
+    phase = rings % 1.0
+    late = _step(phase, 0.66, 0.6) * (1.0 - _step(phase, 0.96, 0.08))  # slow darkening, sudden end of a year
+    fibre = _noise((x + 0.6 * bend, y), (120, 3), 13) + 0.6 * _noise((x + 0.6 * bend, y), (240, 5), 18)
+    pores = _step(_noise((x + 0.6 * bend, y), (170, 12), 14), 0.5, 0.2)
+    tone = 0.30 + 0.42 * late + 0.13 * fibre + 0.16 * _noise(at, (3, 1), 15)
+    return _mix(_ramp(tone, "dcb27a", "c8955a", "a06c38", "784824"), _color("5a3519"), 0.4 * pores)
+
+
+@pattern(0.9, roughness=0.15)
+def marble(at: Grid) -> Doubles:
+    near = _warped(at, 2, 0.22, 21)
+    far = _warped(near, 6, 0.03, 22)
+    x, y = far
+    clouds = 0.5 + 0.5 * _clouds(near, (3, 3), 4, 25)
+    veins = np.zeros((SIDE, SIDE))
+    for across, down, width, depth, seed in ((1, 1, 0.05, 0.75, 23), (2, 1, 0.02, 0.45, 24), (1, 3, 0.012, 0.3, 26)):
+        wave = np.abs(np.sin(np.pi * (across * x + down * y + 0.5 * _clouds(far, (2, 2), 4, seed))))
+        strength = 0.25 + 0.75 * _step(_clouds(near, (3, 3), 2, seed + 50), 0.0, 0.8)
+        veins += depth * strength * (np.exp(-((wave / width) ** 2)) + 0.3 * np.exp(-(wave / (4.0 * width))))
+    base = _mix(_color("f4f2ee"), _color("c6c8ca"), 0.8 * _step(clouds, 0.58, 0.8))
+    return _mix(base, _color("4c5159"), np.clip(veins, 0.0, 0.9))
+
+
+@pattern(0.6, roughness=0.9, specular=0.2)
+def brick(at: Grid) -> Doubles:
+    x, y = _warped(at, 12, 0.0035, 31)
+    rows, columns = 8, 4
+    row = np.floor(y * rows)
+    across = x * columns + 0.5 * (row % 2.0)
+    column = np.floor(across) % columns
+    # distance to the edge of the brick, in heights of a course
+    edge_x = 2.0 * (0.5 - np.abs(across % 1.0 - 0.5))
+    edge_y = 0.5 - np.abs(y * rows % 1.0 - 0.5)
+    solid = _step(np.minimum(edge_x, edge_y) + 0.02 * _noise(at, (60, 60), 32), 0.075, 0.05)
+    tone = np.random.Generator(np.random.PCG64(33)).random((rows, columns))
+    chosen = tone[row.astype(np.int64) % rows, column.astype(np.int64)]
+    grain = _clouds(at, (40, 40), 3, 34)
+    brick = _ramp(chosen + 0.22 * grain, "7c2f22", "9a3f2b", "ad4d35", "bd6547", "a5553c")
+    brick = _mix(brick, _color("4f211a"), 0.5 * _step(_clouds(at, (70, 70), 2, 35), 0.35, 0.2))
+    mortar = _color("c3bbac") + 0.10 * _clouds(at, (80, 80), 2, 36)[..., None]
+    return _mix(mortar, brick, solid)
+
+
+@pattern(0.45, roughness=0.95, specular=0.1)
+def fabric(at: Grid) -> Doubles:
+    x, y = _warped(at, 6, 0.004, 41)
+    count = 16
+    across, down = x * count, y * count
+    round_x, round_y = np.sin(np.pi * (across % 1.0)), np.sin(np.pi * (down % 1.0))
+    over = (np.floor(across) + np.floor(down)) % 2.0  # 1: the warp (upright thread) lies on top
+    height = np.where(over > 0.5, round_x * (0.55 + 0.45 * round_y), round_y * (0.55 + 0.45 * round_x))
+    fibres_up = _noise((x, y), (count * 8, count), 42)
+    fibres_flat = _noise((x, y), (count, count * 8), 43)
+    fibres = np.where(over > 0.5, fibres_up, fibres_flat)
+    generator = np.random.Generator(np.random.PCG64(44))
+    warp_tone, weft_tone = generator.uniform(0.8, 1.1, count), generator.uniform(0.8, 1.1, count)
+    warp = _color("b9a77f") * warp_tone[np.floor(across).astype(np.int64) % count][..., None]
+    weft = _color("3f5f86") * weft_tone[np.floor(down).astype(np.int64) % count][..., None]
+    thread = np.where(over[..., None] > 0.5, warp, weft)
+    return thread * (0.25 + 0.75 * height**0.7 + 0.14 * fibres)[..., None]
+
+
+@pattern(0.7, roughness=0.8, specular=0.2)
+def leopard(at: Grid) -> Doubles:
+    place = _warped(_warped(at, 4, 0.03, 51), 12, 0.012, 52)
+    points = _scattered(42, 53)
+    distance, index = _cells(place, points)
+    generator = np.random.Generator(np.random.PCG64(54))
+    size = generator.uniform(0.85, 1.15, len(points))[index[..., 0]]
+    radius = distance[..., 0] / size
+    offset_x = (place[0] - points[index[..., 0], 0] + 0.5) % 1.0 - 0.5
+    offset_y = (place[1] - points[index[..., 0], 1] + 0.5) % 1.0 - 0.5
+    angle = np.arctan2(offset_y, offset_x)
+    turn = generator.uniform(0.0, 2.0 * np.pi, len(points))[index[..., 0]]
+    broken = _step(np.cos(3.0 * angle + turn) + 0.6 * np.cos(2.0 * angle - 2.0 * turn), -0.75, 0.5)
+    ring = _step(radius, 0.031, 0.008) * (1.0 - _step(radius, 0.056 + 0.004 * np.cos(angle + turn), 0.008))
+    core = 1.0 - _step(radius, 0.042, 0.02)
+    fur = _clouds(at, (24, 90), 2, 55)
+    coat = _mix(_color("d8a861"), _color("e7c58c"), 0.5 + 0.5 * _clouds(at, (3, 3), 2, 56))
+    coat = _mix(coat, _color("a9692f"), 0.75 * core)
+    small, _ = _cells(place, _scattered(150, 57), 1)
+    between = _step(distance[..., 0], 0.07, 0.012)
+    dots = (1.0 - _step(small.reshape(SIDE, SIDE), 0.011, 0.006)) * between
+    spots = np.clip(ring * broken + dots, 0.0, 1.0)
+    return _mix(coat * (1.0 + 0.10 * fur)[..., None], _color("221710"), spots)
+
+
+@pattern(0.8, roughness=0.8, specular=0.2)
+def zebra(at: Grid) -> Doubles:
+    stripes = _turing((0.42, 0.125), 0.0, 61)
+    black = _step(stripes + 0.12 * _noise(at, (10, 40), 62), 0.0, 0.7)
+    fur = 1.0 + 0.06 * _clouds(at, (30, 110), 2, 63)
+    return _mix(_color("efeae0"), _color("17140f"), black) * fur[..., None]
+
+
+@pattern(0.5, roughness=0.4)
+def checker(at: Grid) -> Doubles:
+    x, y = at
+    odd = (np.floor(4.0 * x) + np.floor(4.0 * y)) % 2.0
+    return _mix(_color("f2f2f0"), _color("191919"), odd)
+
+
+@pattern(0.7, roughness=0.85, metallic=0.1, specular=0.3)
+def rust(at: Grid) -> Doubles:
+    place = _warped(at, 4, 0.06, 71)
+    broad = 0.5 + 0.5 * _clouds(place, (3, 3), 5, 72)
+    grain = _clouds(at, (48, 48), 3, 73)
+    tone = np.clip(1.5 * (broad - 0.5) + 0.5 + 0.22 * grain, 0.0, 1.0)
+    oxide = _ramp(tone, "2e1710", "5a2712", "8b3f16", "b5591d", "cf7b33")
+    paint = _color("5d6668") + 0.05 * _clouds(at, (20, 20), 2, 74)[..., None]
+    left = _step(_clouds(_warped(place, 16, 0.015, 75), (4, 4), 4, 76), 0.26, 0.05)  # paint that has not come off yet
+    rim = _step(_clouds(_warped(place, 16, 0.015, 75), (4, 4), 4, 76), 0.20, 0.10) - left
+    surface = _mix(_mix(oxide, _color("20100b"), 0.7 * np.clip(rim, 0.0, 1.0)), paint, 0.85 * left)
+    pits = _step(_noise(at, (70, 70), 77), 0.5, 0.15)
+    return _mix(surface, _color("1b0d09"), 0.6 * pits)
+
+
+@pattern(0.5, roughness=0.9, specular=0.1)
+def grass(at: Grid) -> Doubles:
+    """Blades drawn one over the other, bent and lighter towards the tip; later ones lie on top."""
+    generator = np.random.Generator(np.random.PCG64(81))
+    count, samples, broad = 2600, 64, 5
+    root = generator.random((count, 1, 1, 2))
+    lean = generator.normal(-np.pi / 2, 0.55, (count, 1, 1))
+    bend = generator.normal(0.0, 0.9, (count, 1, 1))
+    length = generator.uniform(0.08, 0.17, (count, 1, 1))
+    along = np.linspace(0.0, 1.0, samples)[None, :, None]
+    side = (np.linspace(-1.0, 1.0, broad))[None, None, :] * 0.0042 * (1.0 - along**2)
+    heading = lean + bend * along
+    x = root[..., 0] + length * along * np.cos(lean + 0.5 * bend * along) - side * np.sin(heading)
+    y = root[..., 1] + length * along * np.sin(lean + 0.5 * bend * along) + side * np.cos(heading)
+    lit = 0.30 + 0.70 * along + 0.12 * np.linspace(-1.0, 1.0, broad)[None, None, :]
+    hue = generator.random((count, 1, 1, 1)) ** 1.5
+    blade = (_color("3f7a1e") + (_color("a5b446") - _color("3f7a1e")) * hue) * lit[..., None]
+    column = np.floor(x * SIDE).astype(np.int64) % SIDE
+    row = np.floor(y * SIDE).astype(np.int64) % SIDE
+    texels = np.broadcast_to(_color("14240b"), (SIDE * SIDE, 3)).copy()
+    cell = (row * SIDE + column).reshape(-1)
+    order = np.arange(cell.size)
+    top = np.full(SIDE * SIDE, -1)
+    np.maximum.at(top, cell, order)
+    drawn = top >= 0
+    texels[drawn] = np.broadcast_to(blade, (*x.shape, 3)).reshape(-1, 3)[top[drawn]]
+    return np.asarray(texels.reshape(SIDE, SIDE, 3))
+
+
+@pattern(0.5, roughness=0.85, specular=0.2)
+def elephant(at: Grid) -> Doubles:
+    place = _warped(_warped(at, 3, 0.05, 91), 14, 0.012, 92)
+    folds = np.zeros((SIDE, SIDE))
+    for count, width, depth, seed in ((45, 0.013, 0.75, 93), (320, 0.006, 0.42, 94)):
+        stretched = _scattered(count, seed)
+        distance, _ = _cells(place, stretched)
+        folds += depth * np.exp(-(((distance[..., 1] - distance[..., 0]) / width) ** 2))
+    long = np.abs(_clouds(_warped(at, 5, 0.04, 95), (3, 14), 3, 96))
+    folds += 0.55 * np.exp(-((long / 0.035) ** 2))
+    tone = 0.55 + 0.25 * _clouds(place, (3, 3), 3, 97) + 0.16 * _clouds(at, (60, 60), 2, 98)
+    hide = _ramp(tone, "5f5850", "7d756c", "958d84", "a9a29a")
+    return _mix(hide, _color("342f2b"), np.clip(folds, 0.0, 0.9))
+
+
+@pattern(0.5, roughness=0.32, metallic=1.0)
+def steel(at: Grid) -> Doubles:
+    scratches = _noise(at, (3, 240), 101) + 0.6 * _noise(at, (7, 120), 102) + 0.4 * _noise(at, (2, 256), 103)
+    tone = 0.72 + 0.09 * scratches + 0.03 * _noise(at, (2, 2), 104)
+    return np.asarray(tone[..., None] * _color("fbfdff"))
+
+
+@cache
+def tile(name: str) -> Floats:
+    """Return one tile of a pattern: (SIDE, SIDE, 3) float32 display-referred sRGB in [0, 1]; do not change it."""
+    line = (np.arange(SIDE) + 0.5) / SIDE
+    across, down = np.meshgrid(line, line)
+    painted = np.clip(PATTERNS[name].paint((across, down)), 0.0, 1.0).astype(np.float32)
+    painted.setflags(write=False)
+    return painted
+
+
+# ---- on an object ----------------------------------------------------------------------------------------------------
+
+
+def covering(mesh: Mesh, name: str, side: int = SIDE) -> Floats:
+    """Return the texture that covers a mesh with a pattern at one scale all over, whatever its texture coordinates.
+
+    Every texel of the texture looks up the tile at its place on the object, seen along the three axes, weighted by the
+    normal ("triplanar" mapping; Geiss, GPU Gems 3, 2007, section 1.5). So charts meet without a seam, and the
+    pattern's scale does not depend on how the object was unwrapped. Rows of the tile stand upright on upright walls.
+
+    Args:
+        mesh: one object size large, in its own coordinates.
+        name: a key of `PATTERNS`.
+        side: of the texture in texels.
+
+    Returns:
+        (side, side, 3) float32 display-referred sRGB in [0, 1], row 0 at v = 1.
+    """
+    positions, normals = _places(mesh, side)
+    scale = SIDE / PATTERNS[name].size
+    weights = np.abs(normals) ** BLEND
+    weights /= weights.sum(axis=-1, keepdims=True)
+    texels = np.zeros((side, side, 3), dtype=np.float32)
+    for axis, (right, up) in enumerate(((1, 2), (0, 2), (0, 1))):
+        seen = looked_up(tile(name), positions[..., right] * scale, -positions[..., up] * scale)
+        texels += weights[..., axis : axis + 1] * seen
+    return texels
+
+
+@lru_cache(maxsize=2)
+def _places(mesh: Mesh, side: int) -> tuple[Floats, Floats]:
+    """Positions and normals (side, side, 3) behind the texels of a mesh."""
+    positions, normals, _ = texel_positions(mesh, side)
+    return positions, normals
+
 
 OWN = "own"
 NUMBERS = tuple(one.name for one in MATERIAL)

@@ -12,13 +12,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Parameter
+from advsearch.controls.base import Fixed, Moved, OneOf, Parameter
 from advsearch.controls.numbers import NumberControl, Slot, Values
 from advsearch.controls.ranges import LARGEST
-from advsearch.controls.values import Fixed, Moved, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.mitsuba_backend.keys import plugin_numbers
+from advsearch.scene.mitsuba_backend.writing import plugin_numbers
 from advsearch.scene.parts import PluginNumber, PluginNumbers
 from advsearch.scene.settings import CHANNELS
 

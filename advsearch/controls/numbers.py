@@ -22,23 +22,30 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Control, Group, Parameter, Value, measure
-from advsearch.controls.ranges import Range
-from advsearch.controls.values import (
+from advsearch.controls.base import (
+    NOTHING,
+    WHOLE_RANGE,
+    Budget,
+    Control,
     Fixed,
+    Group,
     Moved,
     Number,
     OneOf,
+    Parameter,
     Spec,
+    Value,
     apart,
     check_start,
     in_words,
+    measure,
     nearest,
     option_index,
     same,
     to_unit,
     to_value,
 )
+from advsearch.controls.ranges import Range
 from advsearch.copies import hand_copies
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT

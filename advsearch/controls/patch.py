@@ -27,12 +27,27 @@ import torch.nn.functional as F
 from scipy import spatial
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, WHOLE_RANGE, Budget, Choice, Parameter, Value, change_in_colour, number
+from advsearch.controls.base import (
+    LARGEST_EPSILON,
+    NOTHING,
+    WHOLE_RANGE,
+    Budget,
+    Choice,
+    Fixed,
+    Moved,
+    Number,
+    OneOf,
+    Parameter,
+    Spec,
+    Value,
+    change_in_colour,
+    in_words,
+    number,
+)
 from advsearch.controls.corruption_filters import picture, planes, resized
 from advsearch.controls.numbers import NumberControl, Slot, Values
 from advsearch.controls.ranges import Range
 from advsearch.controls.texture import radius, resampled
-from advsearch.controls.values import LARGEST_EPSILON, Fixed, Moved, Number, OneOf, Spec, in_words
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import Doubles, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear

@@ -21,10 +21,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, Value, measure
+from advsearch.controls.base import Choice, Number, OneOf, Parameter, Spec, Value, measure
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.pose import euler
-from advsearch.controls.values import Number, OneOf, Spec
 from advsearch.described import rounded
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text

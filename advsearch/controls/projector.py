@@ -23,18 +23,27 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter, Value, measure, number
+from advsearch.controls.base import (
+    LARGEST_EPSILON,
+    WHOLE_RANGE,
+    Budget,
+    Choice,
+    Fixed,
+    Number,
+    Parameter,
+    Value,
+    measure,
+    number,
+)
 from advsearch.controls.corruption_filters import picture, planes
 from advsearch.controls.numbers import Values
 from advsearch.controls.patch import PRINT_SIDE, PictureControl, enlarged
 from advsearch.controls.ranges import Range
 from advsearch.controls.texture import NORMS, radius
-from advsearch.controls.values import LARGEST_EPSILON, Fixed, Number
 from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.exposure import METERED_WHITE, WHITE, metered_gain
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.formation import METERED_WHITE, WHITE, metered_gain, to_8_bit
 from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middle
 from advsearch.scene.parts import ProjectorPart
 from advsearch.scene.settings import LIT, moving

@@ -18,13 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, Value, measure
+from advsearch.controls.base import Choice, Number, Parameter, Value, measure
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.occlusion import SURROUNDINGS, camera_in, put_away
-from advsearch.controls.values import Number
 from advsearch.scene.assets import Doubles, Material, Mesh
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.exposure import arriving
+from advsearch.scene.formation import arriving
 from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middle
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import moving

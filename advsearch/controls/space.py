@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from advsearch.controls.base import NOTHING, Control, Group, Value
+from advsearch.controls.base import NOTHING, Control, Group, Moved, Value
 from advsearch.controls.numbers import NumberControl
-from advsearch.controls.values import Moved
 from advsearch.copies import is_ours
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription

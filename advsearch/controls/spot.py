@@ -14,10 +14,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, Value, measure, number
+from advsearch.controls.base import Choice, Number, Parameter, Value, measure, number
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.projector import LUMENS, TIMES, ProjectorControl
-from advsearch.controls.values import Number
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.settings import CHANNELS, LIT, colors
 

@@ -20,9 +20,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, Budget, Choice, Control, Group, Parameter, Value, change_in_colour
+from advsearch.controls.base import (
+    LARGEST_EPSILON,
+    NOTHING,
+    Budget,
+    Choice,
+    Control,
+    Group,
+    Parameter,
+    Value,
+    change_in_colour,
+)
 from advsearch.controls.corruption_filters import resized
-from advsearch.controls.values import LARGEST_EPSILON
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Bools, Floats, Mesh
 from advsearch.scene.color import srgb_to_linear

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
-from advsearch.attacks.domain import Domain, centre_of_option
-from advsearch.attacks.draws import Draws
+from advsearch.attacks.domain import Domain, Draws, centre_of_option
 from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.engine.acceptance import ComparedView
 from advsearch.engine.transport import PredictedSearch

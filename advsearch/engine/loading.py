@@ -36,12 +36,11 @@ from advsearch.scene.description import (
     check_one_environment,
     describe,
 )
-from advsearch.scene.formation import EVERYTHING, SAMPLER, ImageFormation
+from advsearch.scene.formation import A_PIXEL, EVERYTHING, FEWEST, MOST, SAMPLER, ImageFormation, Moment, moments_of
 from advsearch.scene.grounds import on_its_ground
 from advsearch.scene.headlamps import with_lamps
 from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.moments import A_PIXEL, FEWEST, MOST, Moment, moments_of
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA, Given
 from advsearch.settings import as_python, read_controls

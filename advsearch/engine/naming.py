@@ -26,8 +26,7 @@ from advsearch.scene.rig import read_rig
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
 from advsearch.tasks import Task
-from advsearch.tasks.rig import Rig
-from advsearch.tasks.together import Together, together
+from advsearch.tasks.together import Rig, Together, together
 
 
 def scene_of(config: SceneConfig, name: str | None = None, environment: str | None = None) -> Scene:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
@@ -9,7 +10,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from advsearch import seeds
@@ -19,16 +22,26 @@ from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, 
 from advsearch.controls import Space
 from advsearch.described import Value
 from advsearch.engine.acceptance import ComparedView, view_of
-from advsearch.engine.judging import Described, KnownTruths, Looked, Metrics, judgements, mean_metrics, with_things
-from advsearch.engine.objective import ConfigurationInputs, domain_of
+from advsearch.engine.judging import (
+    ConfigurationInputs,
+    Described,
+    KnownTruths,
+    Looked,
+    Metrics,
+    domain_of,
+    judgements,
+    mean_metrics,
+    with_things,
+)
 from advsearch.models import Model
 from advsearch.runs.results import GroupDerivative, PlannedGradient
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import NO_MAP
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients import GradientPlan, Group
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import Linearised, LinearRenderer, linear_inputs
-from advsearch.tasks import Facts, Judgement, Mark, Task
+from advsearch.tasks import Facts, Judgement, Mark, Prediction, Task
 from advsearch.tasks.base import Output, Truth, mean, typical
 
 
@@ -431,3 +444,42 @@ def hard_first(values: Tensor) -> Tensor:
     if not bool(torch.isfinite(spread)) or float(spread) == 0.0:
         return torch.ones_like(known)
     return len(known) * torch.softmax(-known / spread, dim=0)
+
+
+# ---- What is changed in a picture to see whether the model says something else, as it must or must not --------------
+
+
+def _brighter(picture: Tensor) -> Tensor:
+    brighter: Tensor = linear_to_srgb(srgb_to_linear(picture) * 2.0 ** (1.0 / 3.0))
+    return brighter
+
+
+def _compressed(picture: Tensor) -> Tensor:
+    file = io.BytesIO()
+    Image.fromarray((picture * 255.0).round().byte().numpy()).save(file, "JPEG", quality=95)
+    return torch.from_numpy(np.array(Image.open(file, formats=["JPEG"]))).to(picture) / 255.0
+
+
+CHANGED: dict[str, Callable[[Tensor], Tensor]] = {
+    "black": torch.zeros_like,
+    "covered": lambda picture: picture.mean(dim=(0, 1)).expand_as(picture).contiguous(),
+    "exposure": _brighter,
+    "shift": lambda picture: torch.cat([picture[:, :1], picture[:, :-1]], dim=1),
+    "jpeg": _compressed,
+}
+"""What makes the changed picture of one (H, W, 3), sRGB in [0, 1]."""
+
+AWAY = "away"  # what is rendered again, see `Assembly.away`
+ALIKE = 0.1  # how far the probability of one label may move, and nothing has changed for `must_change`
+
+
+def changed(picture: Tensor, when: str, cameras: int = 1) -> Tensor:
+    """Return a picture (H, W, 3) that is changed as a name of `CHANGED` says; of a rig those of all its cameras."""
+    return torch.cat([CHANGED[when](part) for part in picture.chunk(cameras, dim=1)], dim=1)
+
+
+def as_claimed(claim: str, before: Prediction, after: Prediction) -> bool:
+    """Return whether a change did what is claimed: that it `must_change` what the model says, or `must_not_change`."""
+    moved = abs((before.probability or 0.0) - (after.probability or 0.0))
+    another = before.label != after.label
+    return another or moved > ALIKE if claim == "must_change" else not another

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from advsearch import seeds
 from advsearch.config import PICTURE_SPP, PICTURES, SceneConfig
 from advsearch.controls import compose
-from advsearch.controls.values import sentences
+from advsearch.controls.base import sentences
 from advsearch.described import Value
 from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
 from advsearch.errors import InputError, UnknownNameError
@@ -22,10 +22,9 @@ from advsearch.files import JsonObject
 from advsearch.models import Model, load_model
 from advsearch.models.guards import plainly
 from advsearch.progress import Watched, watcher
-from advsearch.report.marks import contact_sheet, marked
+from advsearch.report.figures import contact_sheet, marked
 from advsearch.report.wording import seen_text
-from advsearch.runs.files import placed_by
-from advsearch.runs.images import png_bytes, write_exr, write_layers, write_png
+from advsearch.runs.files import placed_by, png_bytes, write_exr, write_layers, write_png
 from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewPredictions
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import SAMPLER, ImageFormation, to_8_bit
@@ -36,8 +35,7 @@ from advsearch.scene.surfaces import Surfaces
 from advsearch.scene.things import ALL
 from advsearch.settings import as_python
 from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, make_task
-from advsearch.tasks.each_thing import each_thing
-from advsearch.tasks.rig import Rig
+from advsearch.tasks.together import Rig, each_thing
 
 MOST_PREDICTIONS = 5  # predictions of the model that are kept of a picture
 

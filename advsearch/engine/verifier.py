@@ -13,10 +13,18 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Ending, Evaluation, SearchResult, Verification, choose_spp, run_trials, verify
-from advsearch.attacks.draws import batches
+from advsearch.attacks.domain import batches
 from advsearch.attacks.evaluation import Query, most_at_once
-from advsearch.attacks.rate_samples import CONDITIONS, OVER_LADDER, affordable, choose_rate_spp
-from advsearch.attacks.trials import LADDER, SampleCount, margins_of, most_samples
+from advsearch.attacks.trials import (
+    CONDITIONS,
+    LADDER,
+    OVER_LADDER,
+    SampleCount,
+    affordable,
+    choose_rate_spp,
+    margins_of,
+    most_samples,
+)
 from advsearch.cluster import Executor
 from advsearch.config import SceneConfig
 from advsearch.engine.journal import Journal, Shared

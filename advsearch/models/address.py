@@ -69,7 +69,7 @@ REFUSED = "(refused)"  # the words of a model that declines to answer
 Levels: TypeAlias = npt.NDArray[np.uint8]  # A picture (H, W, 3) as a file has it
 
 
-class Notes(Protocol):
+class KeepsAnswers(Protocol):
     """What a run keeps notes in."""
 
     def noted(self, key: str) -> Any:
@@ -183,9 +183,9 @@ class Line:
     limits: Mapping[str, float]
     spec: str
     spent: Counter[str] = field(default_factory=Counter)
-    store: Notes | None = None
+    store: KeepsAnswers | None = None
 
-    def keep_in(self, store: Notes) -> None:
+    def keep_in(self, store: KeepsAnswers) -> None:
         """Keep what is spent in a run from here on, and go on counting where the run stopped."""
         self.spent += Counter(store.noted(self._note) or {})
         self.store = store
@@ -395,7 +395,7 @@ class AskedModel:
         self.names: tuple[str, ...] = ()
         self._known: dict[str, dict[str, Any]] = {}
 
-    def keep_in(self, store: Notes) -> None:
+    def keep_in(self, store: KeepsAnswers) -> None:
         """Keep answers in a run from here on; those that it has are not asked for again."""
         self.line.keep_in(store)
 

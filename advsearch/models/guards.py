@@ -10,14 +10,14 @@ import io
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeVar, final
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from advsearch import files
 from advsearch.models.model import CPU
@@ -158,3 +158,37 @@ def called_under(module: nn.Module, switches: Switches) -> None:
 
     module.register_forward_pre_hook(enter)
     module.register_forward_hook(leave, always_call=True)
+
+
+# ---- A network that takes a state beside pictures, as one of pictures alone -----------------------------------------
+
+PICTURE = "observation.image"  # what a policy's `select_action` calls the picture
+
+
+@final
+class WithState(nn.Module):
+    """A policy of pictures and a state that stays as it is.
+
+    A policy with a method `select_action` is called as LeRobot's are: with one mapping of the pictures, as `PICTURE`,
+    and of the state, after `reset` where it has one, since what it still holds belongs to an earlier picture. Others
+    are called with the pictures and the mapping, or with the pictures alone where the state is empty.
+
+    Args:
+        network: the policy.
+        state: numbers by name.
+    """
+
+    def __init__(self, network: Callable[..., Any], state: Mapping[str, Sequence[float]]) -> None:
+        super().__init__()
+        self.network, self.state = network, dict(state)
+        self.training = False
+
+    def forward(self, images: Tensor) -> Any:
+        """Return what the policy does for pictures (N, ...); it gets each part of the state as (N, numbers)."""
+        state = {name: images.new_tensor(numbers).expand(len(images), -1) for name, numbers in self.state.items()}
+        select = getattr(self.network, "select_action", None)
+        if select is None:
+            return self.network(images, state) if state else self.network(images)
+        getattr(self.network, "reset", lambda: None)()
+        with torch.set_grad_enabled(torch.is_grad_enabled()):
+            return select({PICTURE: images, **state})

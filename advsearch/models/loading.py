@@ -15,13 +15,12 @@ from torch import nn
 
 from advsearch.errors import InputError, ModelError, UnknownNameError, resembling
 from advsearch.models import address, files, reference
-from advsearch.models.guards import called_under, plainly, turned_by_code
+from advsearch.models.guards import WithState, called_under, plainly, turned_by_code
 from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
 from advsearch.models.model import PRESETS, Model, Preprocessing, Read, Triple
 from advsearch.models.probe import probe
 from advsearch.models.source import Purpose, Source, load_callable, source_of, split_weights
-from advsearch.models.with_state import WithState
-from advsearch.models.zoo import named, transformers
+from advsearch.models.zoo import outputs, transformers
 from advsearch.registry import Registry
 
 DEFAULT_INPUT_SIZE = (224, 224)  # where neither the model nor the caller says
@@ -29,8 +28,8 @@ DEFAULT_INPUT_SIZE = (224, 224)  # where neither the model nor the caller says
 SOURCES: Registry[Callable[[str], Source | Model]] = Registry(
     "advsearch.models",
     {
-        "torchvision": named.load_torchvision,
-        "timm": named.load_timm,
+        "torchvision": outputs.load_torchvision,
+        "timm": outputs.load_timm,
         "hf": transformers.load,
         "http": address.load,
         "https": address.load,
@@ -170,7 +169,7 @@ def _find(spec: object) -> Source | Model:
     if isinstance(spec, Model):
         return spec
     if isinstance(spec, nn.Module):
-        return transformers.of_network(spec) or named.of_timm(spec) or source_of(spec, type(spec).__name__)
+        return transformers.of_network(spec) or outputs.of_timm(spec) or source_of(spec, type(spec).__name__)
     if isinstance(spec, os.PathLike):
         return files.load_file(Path(spec))
     if not isinstance(spec, str):

@@ -15,10 +15,9 @@ from torch import Tensor, nn
 from advsearch import files
 from advsearch.errors import AdvsearchError, ModelError
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.guards import TookTooLong, within
+from advsearch.models.guards import TookTooLong, WithState, within
 from advsearch.models.labels import fitting_labels
 from advsearch.models.model import Detaching, Model, logits_of, read_by, tensors_in, warn
-from advsearch.models.with_state import WithState
 
 PROBABILITY_TOLERANCE = 1e-3  # rows that are non-negative and sum to 1 within this are taken for probabilities
 PERCENT_TOLERANCE = 5e-3  # rows that are non-negative and sum to 100 within this share of it, for percentages

@@ -12,8 +12,16 @@ from advsearch.question import Asked, question
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, GREY, RED
-from advsearch.report.markup import InNotebook
-from advsearch.report.shown import Claim, Column, ResultPart, ShownResult, average_claim, case_claim, searches_text
+from advsearch.report.shown import (
+    Claim,
+    Column,
+    InNotebook,
+    ResultPart,
+    ShownResult,
+    average_claim,
+    case_claim,
+    searches_text,
+)
 from advsearch.report.wording import margin_text, percent
 from advsearch.runs.results import AverageCase, Fields, JsonFloat, StudyResult, VerifiedRate
 from advsearch.settings import setting_as_in

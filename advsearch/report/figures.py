@@ -14,10 +14,13 @@ from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
+from PIL import Image, ImageDraw, ImageFont
+
+from advsearch.runs.files import to_8bit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
 
 Figures = dict[str, bytes]  # A suffix, png or svg, to the content of a file
 
@@ -140,3 +143,144 @@ def axis_title(name: str, unit: str) -> str:
 def figure_of(draw: Callable[[Any], object], size: tuple[float, float]) -> Figures:
     """Return what is drawn on the axes of a new figure of a size in inches."""
     return drawn(lambda figure: draw(figure.subplots()), size)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Pictures with something drawn into them, boxes and masks of what is true and what is said; or several on a sheet.
+
+Floats = npt.NDArray[np.float32]
+TRUE, SAID = (0, 190, 255), (255, 110, 0)
+"""Colours of what is true and of what the model says; told apart in any kind of colour vision."""
+SMALLEST = 512  # Pixels of the longest side at least; smaller pictures are magnified, so that text can be read
+TINT, LETTERS = 0.45, 28  # How much of a tint covers a picture; how many letters are as high as its longest side
+
+Box = tuple[float, float, float, float]
+Shape = Any  # What is drawn, a box or the pixels of a mask: `advsearch.tasks.Mark`
+
+
+def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
+    """Return a picture (H, W, 3), display-referred sRGB in [0, 1], with shapes drawn into it, magnified where it is
+    small: (h, w, 3) float32.
+
+    The box or the outline of what is true is blue; a box of the model is orange, and its mask tinted so. The text of a
+    box stands at its upper left corner, that of the true one at the lower left. Maps stand to the right of the picture,
+    what is true first, in greys of one range: that of what is true.
+    """
+    levels = to_8bit(picture)
+    factor = max(1, -(-SMALLEST // max(levels.shape[:2])))
+    size = levels.shape[1] * factor, levels.shape[0] * factor
+    image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
+    for shape in sorted(shapes, key=lambda shape: shape.true):
+        if shape.mask is not None:
+            _draw_mask(image, np.asarray(shape.mask, dtype=bool), shape.true)
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(max(size) // LETTERS)
+    boxes = [(shape, _corners(shape.box, factor, size)) for shape in shapes if shape.box is not None]
+    for shape, ends in boxes:
+        draw.rectangle(ends, outline=_colour(shape), width=2)
+    written: list[tuple[int, int, int, int]] = []
+    for shape, ends in boxes:
+        written.append(_write(draw, shape, ends, size, font, written))
+    maps = sorted((shape for shape in shapes if shape.map is not None), key=lambda shape: not shape.true)
+    panels = [image, *(_panel(shape, maps[0].map, size, font) for shape in maps)]
+    sheet: Floats = np.hstack([np.asarray(panel, dtype=np.float32) for panel in panels]) / np.float32(255.0)
+    return sheet
+
+
+def _panel(shape: Shape, first: Any, size: tuple[int, int], font: Any) -> Image.Image:
+    """A map in greys, in the range that the first of them has."""
+    low, high = float(first.min()), float(first.max())
+    greys = np.clip((np.asarray(shape.map, dtype=np.float64) - low) / max(high - low, 1e-12), 0.0, 1.0)
+    levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
+    panel = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST).convert("RGB")
+    _write(ImageDraw.Draw(panel), shape, (0, 0, size[0] - 1, size[1] - 1), size, font, [])
+    return panel
+
+
+def _draw_mask(image: Image.Image, mask: npt.NDArray[np.bool_], true: bool) -> None:
+    whole = np.asarray(Image.fromarray(mask).resize(image.size, Image.Resampling.NEAREST))
+    colour, strength = Image.new("RGB", image.size, TRUE if true else SAID), whole * TINT
+    if true:
+        inner = np.pad(whole, 2)[2:-2, 2:-2]
+        for axis in (0, 1):
+            for step in (-2, 2):
+                inner = inner & np.roll(np.pad(whole, 2), step, axis=axis)[2:-2, 2:-2]
+        strength = (whole & ~inner).astype(float)
+    image.paste(colour, (0, 0), Image.fromarray(np.rint(255.0 * strength).astype(np.uint8)))
+
+
+def _colour(shape: Shape) -> tuple[int, int, int]:
+    return TRUE if shape.true else SAID
+
+
+def _corners(box: Box, factor: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """The first and the last pixel of a box in a magnified picture, as far as it is inside."""
+    x0, y0, x1, y1 = (round(end * factor) for end in box)
+    left, top = (min(max(start, 0), side - 1) for start, side in zip((x0, y0), size, strict=True))
+    right, bottom = (min(end, side) - 1 for end, side in zip((x1, y1), size, strict=True))
+    return left, top, max(left, right), max(top, bottom)
+
+
+def _write(
+    draw: ImageDraw.ImageDraw,
+    shape: Shape,
+    ends: tuple[int, int, int, int],
+    size: tuple[int, int],
+    font: Any,
+    others: Sequence[tuple[int, int, int, int]],
+) -> tuple[int, int, int, int]:
+    """Write beside a box, and return where: above it, or below where it is true, where no other text is."""
+    text = f"true: {shape.text}" if shape.true else shape.text
+    left, top, right, bottom = map(round, draw.textbbox((0, 0), text, font=font))
+    wide, high = right - left + 6, bottom - top + 6
+    y = ends[3] if shape.true else ends[1] - high
+    x, y = max(0, min(ends[0], size[0] - wide)), max(0, min(y, size[1] - high))
+
+    def free(row: int) -> bool:
+        return all(x > x1 or x0 > x + wide or row > y1 or y0 > row + high for x0, y0, x1, y1 in others)
+
+    rows = sorted(range(max(size[1] - high, 0) + 1), key=lambda row: (abs(row - y), row))
+    y = next(filter(free, rows), y)
+    draw.rectangle((x, y, x + wide, y + high), fill=_colour(shape))
+    draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)
+    return x, y, x + wide, y + high
+
+
+GAP, LINE = 8, 15  # Pixels between tiles, and of a line of text
+FONT = 12
+NARROWEST = 160  # Pixels that a tile is wide at least, so that its text can be read; smaller pictures are magnified
+
+
+def contact_sheet(pictures: Sequence[Floats], captions: Sequence[Sequence[str]]) -> Floats:
+    """Return pictures (H, W, 3), display-referred sRGB in [0, 1] and all of one size, side by side on white, each over
+    lines of text; what is too long for the tile is cut. As the pictures, float32."""
+    columns = columns_for(len(pictures))
+    rows = math.ceil(len(pictures) / columns)
+    factor = math.ceil(NARROWEST / pictures[0].shape[1])
+    height, width = (factor * side for side in pictures[0].shape[:2])
+    cell = width + GAP, height + LINE * max(map(len, captions)) + GAP
+    sheet = Image.new("RGB", (GAP + columns * cell[0], GAP + rows * cell[1]), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(FONT)
+    for number, (picture, lines) in enumerate(zip(pictures, captions, strict=True)):
+        left, top = GAP + number % columns * cell[0], GAP + number // columns * cell[1]
+        tile = Image.fromarray(to_8bit(picture)).resize((width, height), Image.Resampling.NEAREST)
+        sheet.paste(tile, (left, top))
+        for place, line in enumerate(lines):
+            text = _cut(line, width, draw, font)
+            draw.text((left, top + height + LINE * place), text, fill="black", font=font)
+    levels: Floats = np.asarray(sheet, dtype=np.float32)
+    return np.asarray(levels / np.float32(255.0))
+
+
+def columns_for(count: int) -> int:
+    """Return how many of `count` tiles stand side by side: about the square root, and no holes where that can be."""
+    least = math.ceil(math.sqrt(count))
+    return next((columns for columns in range(least, 2 * least + 1) if count % columns == 0), least)
+
+
+def _cut(line: str, width: int, draw: ImageDraw.ImageDraw, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> str:
+    text = " ".join(line[:200].split())
+    if draw.textlength(text, font=font) <= width:
+        return text
+    while text and draw.textlength(text + "...", font=font) > width:
+        text = text[:-1]
+    return text + "..."

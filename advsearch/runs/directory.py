@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
 from advsearch.files import open_regular
-from advsearch.runs import files, images, store, summary, tracking
+from advsearch.runs import files, store, summary, tracking
 from advsearch.runs.files import PART, storage_errors, write_bytes, write_text
 from advsearch.settings import HEADER
 from advsearch.yaml_text import LARGEST
@@ -210,15 +210,15 @@ class RunDirectory:
     def save_image(self, name: str, image: Any, folder: str = IMAGES) -> Path:
         """Write ``<folder>/<name>.png`` of (H, W, 3) or (H, W), display-referred sRGB in [0, 1], numpy or torch; return
         its path."""
-        return images.write_png(self.path / folder / f"{name}.png", image)
+        return files.write_png(self.path / folder / f"{name}.png", image)
 
     def save_exr(self, name: str, image: Any, folder: str = IMAGES) -> Path:
         """Write ``<folder>/<name>.exr`` with float32 values as given (linear, by convention) and return its path."""
-        return images.write_exr(self.path / folder / f"{name}.exr", image)
+        return files.write_exr(self.path / folder / f"{name}.exr", image)
 
     def save_animation(self, name: str, frames: Sequence[Any]) -> Path:
         """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and return its path."""
-        return write_bytes(self.path / IMAGES / f"{name}.gif", images.animation_bytes(frames))
+        return write_bytes(self.path / IMAGES / f"{name}.gif", files.animation_bytes(frames))
 
     def write_summary(self, result: Result) -> Path:
         return summary.write_summary(self.path, result)

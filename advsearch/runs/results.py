@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 from pydantic.fields import ComputedFieldInfo, FieldInfo
 
-from advsearch import rooms
+from advsearch import registry
 from advsearch.files import JsonObject
 
 if TYPE_CHECKING:
@@ -500,7 +500,7 @@ class SharedWork(Fields):
 
 def kind_of(values: JsonObject) -> type[Result] | None:
     """Return the result that the values of a `summary.json` are of; None if there is none of that command."""
-    room = rooms.room(str(values.get("command")))
+    room = registry.room(str(values.get("command")))
     if room is None:
         return None
     kind: type[Result] | None = next(

@@ -4,18 +4,96 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import fields
+from contextlib import suppress
+from dataclasses import asdict, fields
 from itertools import islice
+from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
+from pydantic import Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from advsearch.described import NOT_A_NUMBER
+from advsearch.errors import FileFormatError
 from advsearch.runs.export import as_columns, as_record
 from advsearch.runs.store import NAME, Row, Store
-from advsearch.runs.units import units_of
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Which rows of a sweep are independent: those of different *units*, each of one draw. A unit is a drive with all its
+# frames, or a picture, with the predictions of all models and, where one was swept, without and with the adversarial
+# scene of a run.
+
+NOTE = "units"  # the note of a run that says it
+
+Number = TypeVar("Number", int, npt.NDArray[np.int64])
+
+Count = Annotated[int, Field(strict=True, ge=1)]
+
+
+@dataclass(frozen=True)
+class Units:
+    """How rows follow from draws.
+
+    Attributes:
+        sizes: of the axes of the grid, the last one fastest.
+        frames: place of the axis whose values are frames; None where there is none.
+        samples: draws at each point of the grid.
+        models: that are shown the same pictures.
+        again: pictures after which the draws come again; 0 for never.
+    """
+
+    sizes: tuple[Count, ...] = ()
+    frames: Annotated[int, Field(strict=True, ge=0)] | None = None
+    samples: Count = 1
+    models: Count = 1
+    again: Annotated[int, Field(strict=True, ge=0)] = 0
+
+    @property
+    def size(self) -> int:
+        """Rows of a whole unit."""
+        return self.models * (2 if self.again else 1) * (1 if self.frames is None else self.sizes[self.frames])
+
+    @property
+    def name(self) -> str:
+        """What one is called."""
+        return "picture" if self.frames is None or self.sizes[self.frames] < 2 else "drive"
+
+    def of(self, step: Number) -> Number:
+        """Return the number of the unit of a row, or of rows (n,), by their steps."""
+        return self.draw(step // self.models)
+
+    def draw(self, picture: Number) -> Number:
+        """Return the number of the draw of a picture, by its number in the whole sweep."""
+        if self.again:
+            picture = picture % self.again
+        if self.frames is None:
+            return picture
+        place, sample = picture // self.samples, picture % self.samples
+        after = prod(self.sizes[self.frames + 1 :])
+        before = place // (self.sizes[self.frames] * after)  # scenes are like one more axis, the slowest
+        return (before * after + place % after) * self.samples + sample
+
+    @property
+    def noted(self) -> dict[str, Any]:
+        """What the note says."""
+        return asdict(self)
+
+
+def units_of(store: Store) -> Units | None:
+    """Return what a run notes of its units; None where it notes nothing."""
+    noted = store.noted(NOTE)
+    if noted is None:
+        return None
+    with suppress(ValidationError):
+        units = TypeAdapter(Units).validate_python(noted)
+        if units.frames is None or units.frames < len(units.sizes):
+            return units
+    raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}")
+
 
 KIND = "sweep"  # rows of the sweep itself
 
@@ -46,7 +124,7 @@ def read_sweep(
     run: Path, after: int = 0, most: int | None = None, also: Callable[[Row], Mapping[str, float]] | None = None
 ) -> pd.DataFrame:
     """Return the rows of the sweep in `run` that were written after the row with this id, `most` of them at most, as
-    `sweep_frame` does; `unit` says which rows are not independent (`runs.units`), and ``attrs["edges"]`` where the
+    `sweep_frame` does; `unit` says which rows are not independent (`Units`), and ``attrs["edges"]`` where the
     ranges of drawn parameters are cut. Raises FileFormatError where the results cannot be read."""
     with Store(run / NAME, read_only=True) as store:
         frame, noted = sweep_frame(islice(store.rows(KIND, after=after), most), also), store.noted(EDGES)

@@ -19,12 +19,12 @@ import torch
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import reading
-from advsearch.scene import environments, library, settings
-from advsearch.scene.assets import Doubles, EnvironmentAsset, Material, ObjectAsset
+from advsearch.scene import library, settings
+from advsearch.scene.assets import TRIPOD, Doubles, EnvironmentAsset, Material, ObjectAsset, doubts, on_roads, sized
+from advsearch.scene.camera_entries import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
-from advsearch.scene.camera_presets import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
-from advsearch.scene.exposure import metered_gain
+from advsearch.scene.formation import metered_gain
 from advsearch.scene.geometry import camera_to_world, driving, framing_distance, moved_part, object_to_world, seated
 from advsearch.scene.grounds import Photograph, on_its_ground, paved, photograph_of
 from advsearch.scene.headlamps import with_lamps
@@ -42,10 +42,9 @@ from advsearch.scene.parts import (
     mesh_part,
     plugins_in,
 )
-from advsearch.scene.places.road import FLOOR
+from advsearch.scene.places.quads import FLOOR
 from advsearch.scene.rig import Mount, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
-from advsearch.scene.sizes import TRIPOD, doubts, on_roads, sized
 from advsearch.scene.things import ThingPart, with_things
 
 DEFAULT_ENVIRONMENT = "studio"
@@ -74,7 +73,7 @@ class SceneDescription:
         environment_spec: how the environment was asked for, likewise.
         up: the up axis that was given for a mesh file, or None.
         size: the object's longest side in metres that was given, or None.
-        unit: of the object's file, that was given (`advsearch.scene.sizes.UNITS`), or None.
+        unit: of the object's file, that was given (`advsearch.scene.assets.UNITS`), or None.
         given: what was asked for: names of settings, and "environment".
         parts: what is in the scene beside the object, the environment and the ground: further meshes, lamps, haze.
         thin_lens: the camera has an aperture and a focus distance.
@@ -82,7 +81,7 @@ class SceneDescription:
         aspect: width over height of the picture.
         cameras: those with poses of their own, by name.
         camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
-        preset: name of the mounted camera that it is (`advsearch.scene.camera_presets`); "" for none.
+        preset: name of the mounted camera that it is (`advsearch.scene.camera_entries`); "" for none.
         camera_model: intrinsics and distortion of the camera around the object; None for a pinhole.
         rig: the cameras that take pictures at the same time, the first of them this one; empty where it is alone.
         rig_spec: how they were asked for.
@@ -400,7 +399,7 @@ def describe(
         given: settings to fix, by name.
         up: "y" or "z", the up axis of a mesh file; None takes what its format or else its shape says.
         size: of the object, its longest side in metres.
-        unit: of the coordinates of its file, one of `advsearch.scene.sizes.UNITS`; without both its size is what its
+        unit: of the coordinates of its file, one of `advsearch.scene.assets.UNITS`; without both its size is what its
             format says.
         plugins: a Mitsuba scene as its loader takes it, in which `object_spec` is the id of a shape.
         things: what stands beside the object (`advsearch.scene.things`).
@@ -521,7 +520,7 @@ def _environment(spec: str | Path | EnvironmentAsset) -> EnvironmentAsset | None
         return spec if isinstance(spec, EnvironmentAsset) else None
     if is_path(spec):
         with reading(spec):
-            return environments.import_environment(Path(spec))
+            return library.import_environment(Path(spec))
     return library.load_environment(str(spec))
 
 

@@ -16,9 +16,8 @@ from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, Floats, Mesh
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.places.avenue import AVENUE, built
-from advsearch.scene.places.car_park import CAR_PARK
-from advsearch.scene.places.crossing import CROSSING
-from advsearch.scene.places.road import LAID, ROAD, road
+from advsearch.scene.places.crossing import CAR_PARK, CROSSING
+from advsearch.scene.places.quads import LAID, ROAD, road
 from advsearch.scene.places.room import room
 
 if TYPE_CHECKING:

@@ -30,12 +30,11 @@ from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.scene.assembly import ON_PICTURE, Motion, central, steps_for
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import ImageFormation, levels_of
+from advsearch.scene.formation import ImageFormation, Later, Moment, levels_of
 from advsearch.scene.geometry import camera_to_world, middle
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_order, first_plan
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.moments import Later, Moment
 from advsearch.scene.rig import Mount
 from advsearch.scene.surfaces import Surfaces
 

@@ -19,13 +19,12 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Doubles, ObjectAsset, footing
+from advsearch.scene.assets import LARGEST, SMALLEST, Doubles, ObjectAsset, doubts, footing, sized
 from advsearch.scene.geometry import middle, rotation, standing
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.parts import MeshPart, mesh_part
-from advsearch.scene.places.road import LAID
+from advsearch.scene.places.quads import LAID
 from advsearch.scene.settings import LAMPS
-from advsearch.scene.sizes import LARGEST, SMALLEST, doubts, sized
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription

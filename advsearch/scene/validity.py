@@ -24,7 +24,7 @@ import numpy as np
 from advsearch.scene.assets import Doubles
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.grounds import enclosed, paved
-from advsearch.scene.places.road import EDGES, EYE, FRONTS, LENGTH, STREET_ENDS
+from advsearch.scene.places.quads import EDGES, EYE, FRONTS, LENGTH, STREET_ENDS
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription

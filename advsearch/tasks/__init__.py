@@ -19,10 +19,9 @@ from advsearch.tasks.classification import Classification
 from advsearch.tasks.command import Command
 from advsearch.tasks.depth import Depth
 from advsearch.tasks.detection import Detection
-from advsearch.tasks.rig import Rig
 from advsearch.tasks.segmentation import Segmentation
 from advsearch.tasks.similarity import Similarity
-from advsearch.tasks.together import Together
+from advsearch.tasks.together import Rig, Together
 
 MOST_NUMBERS = 4
 """Of an output that are said one by one."""

@@ -15,7 +15,7 @@ from advsearch import files
 from advsearch.errors import FileFormatError, InputError
 from advsearch.models import Model
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.with_state import WithState
+from advsearch.models.guards import WithState
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Facts, Prediction, Said, Task
 

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, final
 
 import torch
 from torch import Tensor
 
+from advsearch.described import OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.models import Model, Preprocessing
+from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.model import joined
 from advsearch.options import FROM_RUN, JOINED
-from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Task, Truth
+from advsearch.tasks.base import Facts, Judgement, Mark, Output, Prediction, Task, Truth, mean
+from advsearch.tasks.command import Command
 
 Outputs = tuple[Any, ...]
 """What each of several models returns for one picture, or one model for each picture of a rig."""
@@ -182,3 +185,257 @@ class Together(Task):
 def all_said(predictions: Sequence[Prediction]) -> Prediction:
     """Return several predictions as one, in words."""
     return Prediction("; ".join(one.label for one in predictions))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# One task, asked of the object and of every thing beside it: a prediction is right where it is right about all of
+# them.
+#
+# A search is after a wrong prediction about any of them: loss and score are the largest of the things' own.
+
+TruthOfEach = Mapping[str, Truth]
+"""What is true of each thing, by name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EachThing(Task):
+    """Made by `each_thing`.
+
+    Args:
+        part: the task, on its model.
+    """
+
+    name = "each thing"
+    varies = True
+
+    part: Task
+
+    @property
+    def calibrates(self) -> bool:
+        return self.part.calibrates
+
+    def after_calibration(self, output: Output, truth: TruthOfEach | None) -> EachThing:
+        first = None if truth is None else next(iter(truth.values()))
+        return replace(self, part=self.part.after_calibration(output, first))
+
+    def check(self, facts: Facts) -> None:
+        for one in facts.each.values():
+            self.part.check(one)
+
+    def truth(self, facts: Facts) -> TruthOfEach:
+        return {name: self.part.truth(one) for name, one in facts.each.items()}
+
+    def truth_names(self, truth: TruthOfEach) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(name for one in truth.values() for name in self.part.truth_names(one)))
+
+    @property
+    def target_names(self) -> tuple[str, ...]:
+        return self.part.target_names
+
+    def loss(self, output: Output, truth: TruthOfEach) -> Tensor:
+        return self._largest(self.part.loss, output, truth)
+
+    def score(self, output: Output, truth: TruthOfEach) -> Tensor:
+        return -self.loss(output, truth) if self.minimise else self._largest(self.part.score, output, truth)
+
+    def pixel_margin(self, output: Output, truth: TruthOfEach) -> Tensor:
+        """Return that of the thing where it is largest, (N,); of segmentation."""
+        return self._largest(self.part.pixel_margin, output, truth)  # type: ignore[attr-defined]
+
+    @staticmethod
+    def _largest(value: Callable[[Output, Truth], Tensor], output: Output, truth: TruthOfEach) -> Tensor:
+        return torch.stack([value(output, one) for one in truth.values()]).amax(dim=0)
+
+    def predictions(self, output: Output, count: int = 1) -> list[tuple[Prediction, ...]]:
+        return self.part.predictions(output, count)
+
+    def judge(self, output: Output, truth: TruthOfEach) -> list[Judgement]:
+        """See `Task.judge`: the prediction about the thing that is worst, and in the payload what is said of each."""
+        each = zip(*(self.part.judge(output, one) for one in truth.values()), strict=True)
+        with torch.no_grad():
+            scores, margins = self.score(output, truth).tolist(), (0.0 - self.loss(output, truth)).tolist()
+        return [
+            self._judged(dict(zip(truth, said, strict=True)), *at)
+            for said, at in zip(each, zip(scores, margins, strict=True), strict=True)
+        ]
+
+    @staticmethod
+    def _judged(said: Mapping[str, Judgement], score: float, margin: float) -> Judgement:
+        if any(one.not_a_number for one in said.values()):
+            return Judgement.of(score, math.nan, Prediction(""))
+        seen = [name for name in said if said[name].prediction.label != OUT_OF_VIEW] or list(said)
+        worst = min(seen, key=lambda name: said[name].margin)
+        things = {
+            name: {"right": one.right, "margin": one.margin, "answer": one.prediction.label}
+            | ({"box": one.payload.get("box")} if isinstance(one.payload, dict) and "box" in one.payload else {})
+            for name, one in said.items()
+        }
+        kept: Any = said[worst].payload if isinstance(said[worst].payload, dict) else {}
+        average = mean([one.margin for one in said.values()])
+        payload: Any = {**kept, "worst": worst, "mean_margin": average, "things": things}
+        return Judgement.of(score, margin, said[worst].prediction, payload)
+
+    def marks(self, output: Output, truth: TruthOfEach) -> list[list[Mark]]:
+        """See `Task.marks`: what is true of each thing, and the prediction once."""
+        found: list[list[Mark]] = []
+        for marks in zip(*(self.part.marks(output, one) for one in truth.values()), strict=True):
+            said = [mark for mark in marks[0] if not mark.true]
+            found.append([mark for listed in marks for mark in listed if mark.true] + said)
+        return found
+
+
+def each_thing(task: Task) -> EachThing:
+    """Return a task on its model as one that judges every thing.
+
+    Raises:
+        InputError: its models say one thing of a whole picture, or are several.
+    """
+    if isinstance(task, Together) or task.name not in JUDGES:
+        raise InputError(
+            f"judge: all is for {' and '.join(JUDGES)}, got task {task.name}; judge one thing, by its name"
+        )
+    kind: Any = type("EachThing", (EachThing,), {"name": task.name, "objective": task.objective})
+    made: EachThing = kind(part=task, minimise=task.minimise, target=task.target)
+    return made
+
+
+JUDGES: Sequence[str] = ("detection", "segmentation", "depth")
+"""Tasks whose prediction of a picture says something of each thing in it."""
+
+
+# ---- A rig of cameras: a task for each picture, and a rule that makes one prediction of them ------------------------
+
+RULES = ("any", "all", "mean", "vote")
+"""When the rig is right: in any picture, in all, on average of the losses, or in more than half."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rig(Task):
+    """Several cameras take pictures of one configuration, and one prediction is made of what a model says of each.
+
+    Each picture has a truth of its own, such as the box in it. The loss of the rig is the least, the largest or the
+    mean of its pictures' losses, or for `vote` the one that more than half of them are at or below.
+
+    Args:
+        task: of each picture: a name, or a mapping with a `name` and options.
+        rule: one of `RULES`.
+        part: the task on the model, by `on`.
+        cameras: how many there are, by `on`.
+
+    Raises:
+        InputError: no such rule.
+    """
+
+    name = "rig"
+    varies = True
+
+    task: Any = "classification"
+    rule: str = RULES[0]
+    part: Any = field(default=None, metadata=FROM_RUN)
+    cameras: int = field(default=1, metadata=FROM_RUN)
+
+    def __post_init__(self) -> None:
+        if self.rule not in RULES:
+            raise InputError(f"task rig: rule: expected one of {', '.join(RULES)}, got {self.rule!r}")
+        if not isinstance(self.task, (str, Mapping, Task)):
+            raise InputError(f"task rig: task: expected a name, or a mapping with a `name`, got {self.task!r:.80}")
+
+    @property
+    def title(self) -> str:
+        return f"{self.name} of {self.part.title if self.part else self.task}"
+
+    def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Rig:
+        """See `Task.on`. Raises InputError where the scene is seen by one camera."""
+        if model.cameras < 2:
+            raise InputError("task rig: expected a rig, got one camera; give it with `camera=rig.yaml`")
+        part = self.part.on(replace(model, cameras=1), target=target, minimise=minimise)
+        if isinstance(part, Command) and not isinstance(model.module, AllAtOnce):
+            raise InputError(
+                "task rig: task command is of one action for all pictures; give a policy that takes them at once, as "
+                "advsearch.models.all_at_once.AllAtOnce"
+            )
+        return replace(self, part=part, cameras=model.cameras, target=part.target, minimise=minimise)
+
+    def seeking(self, objective: str) -> Rig:
+        return replace(self, part=self.part.seeking(objective))
+
+    def check(self, facts: Facts) -> None:
+        self.part.check(facts)
+
+    def read(self, returned: Any, count: int) -> Any:
+        return returned
+
+    @property
+    def calibrates(self) -> bool:
+        return bool(self.part.calibrates)
+
+    def after_calibration(self, output: Sequence[Outputs], truth: tuple[Truth, ...] | None) -> Rig:
+        return replace(self, part=self.part.after_calibration(output[0][0], None if truth is None else truth[0]))
+
+    @property
+    def ambiguities(self) -> str:
+        return str(self.part.ambiguities)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        return tuple(self.part.remarks)
+
+    def truth(self, facts: Facts) -> tuple[Truth, ...]:
+        return tuple(self.part.truth(one) for one in facts.views or (facts,) * self.cameras)
+
+    def truth_names(self, truth: tuple[Truth, ...]) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(name for one in truth for name in self.part.truth_names(one)))
+
+    @property
+    def target_names(self) -> tuple[str, ...]:
+        return tuple(self.part.target_names)
+
+    def loss(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
+        return self._ruled(self._each("loss", output, truth))
+
+    def score(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
+        """See `Task.score`: a target is reached, and a right prediction made, by the rule."""
+        scores = self._each("score", output, truth)
+        return -self._ruled(-scores) if self.target is not None or self.minimise else self._ruled(scores)
+
+    def _each(self, what: str, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
+        """A number of each picture, (N, K)."""
+        each = [[getattr(self.part, what)(*pair) for pair in zip(one, truth, strict=True)] for one in output]
+        return torch.stack([torch.cat(one) for one in each])
+
+    def _ruled(self, wrong: Tensor) -> Tensor:
+        """How wrong the rig is, (N,), from how wrong it is in each picture, (N, K)."""
+        if self.rule == "mean":
+            return wrong.mean(dim=1)
+        place = {"any": 0, "all": wrong.shape[1] - 1, "vote": wrong.shape[1] // 2}[self.rule]
+        return wrong.sort(dim=1).values[:, place]
+
+    def predictions(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Prediction, ...]]:
+        return [(all_said([self.part.predictions(one)[0][0] for one in each]),) for each in output]
+
+    def judge(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> list[Judgement]:
+        found = []
+        with torch.no_grad():
+            margins, scores = (0.0 - self.loss(output, truth)).tolist(), self.score(output, truth).tolist()
+        for each, margin, score in zip(output, margins, scores, strict=True):
+            said = [self.part.judge(one, true)[0] for one, true in zip(each, truth, strict=True)]
+            lost = any(one.not_a_number for one in said)
+            payload: Any = {
+                "pictures": [
+                    {"prediction": one.prediction.label, "right": one.right, "payload": one.payload} for one in said
+                ]
+            }
+            prediction = all_said([one.prediction for one in said])
+            found.append(Judgement.of(score, math.nan if lost else margin, prediction, payload))
+        return found
+
+    def marks(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> list[list[Mark]]:
+        """See `Task.marks`: those of the first picture, which is at the left."""
+        found = []
+        for each in output:
+            marks = self.part.marks(each[0], truth[0])[0]
+            found.append([replace(one, mask=self._wide(one.mask)) for one in marks if one.map is None])
+        return found
+
+    def _wide(self, mask: Tensor | None) -> Tensor | None:
+        return None if mask is None else torch.cat([mask, *[torch.zeros_like(mask)] * (self.cameras - 1)], dim=-1)

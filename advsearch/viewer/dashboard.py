@@ -12,7 +12,7 @@ from itertools import islice
 from pathlib import Path
 
 from advsearch.report import wording
-from advsearch.report.markup import Html, element, join_html
+from advsearch.report.shown import Html, element, join_html
 from advsearch.runs import files, listing, store
 from advsearch.runs.directory import PARTS, REPORT
 from advsearch.runs.listing import Listed

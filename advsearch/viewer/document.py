@@ -20,7 +20,7 @@ from urllib.parse import quote
 from advsearch import __version__
 from advsearch.files import MESHES
 from advsearch.report import wording
-from advsearch.report.markup import Html, element, join_html
+from advsearch.report.shown import Html, element, join_html
 from advsearch.report.wording import is_command
 from advsearch.runs.directory import CONFIG, PARTS, REPORT
 

@@ -12,14 +12,26 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from advsearch import rooms
+from advsearch import registry
 from advsearch.errors import FileFormatError
 from advsearch.files import read_bytes
-from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, study_chart
-from advsearch.report.shown import Picture, ResultPart, ShownResult, facts_of, remarks_of, shown, subject_of
+from advsearch.report.shown import (
+    NARROW,
+    WIDE,
+    Html,
+    Picture,
+    ResultPart,
+    ShownResult,
+    element,
+    facts_of,
+    join_html,
+    remarks_of,
+    shown,
+    study_chart,
+    subject_of,
+)
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, REPORT, RunDirectory
-from advsearch.runs.files import write_text
-from advsearch.runs.images import smaller_png
+from advsearch.runs.files import smaller_png, write_text
 from advsearch.runs.results import Result
 from advsearch.runs.summary import read_result
 from advsearch.viewer import document
@@ -145,7 +157,7 @@ def write_page(run: Path, result: Result | None = None) -> Path:
 def page_of(run: Path, result: Result) -> str:
     """Return the page of a run, which needs no other file but those of its parts. Raises FileFormatError where other
     results of the run are damaged."""
-    room = rooms.room(result.command)
+    room = registry.room(result.command)
     made: str | None = room.page(run, result) if room and room.page else None
     return made or shown_page(run, result, shown(result))
 

@@ -29,7 +29,7 @@ from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import read_bytes
 from advsearch.questions.photographs import result as photos
 from advsearch.questions.sweep.page import SweepSource, result_of, sweep_page_html
-from advsearch.report.markup import element, join_html
+from advsearch.report.shown import element, join_html
 from advsearch.runs import files, listing
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
 from advsearch.viewer.clients import (

@@ -22,7 +22,7 @@ from advsearch.cli.main import main
 from advsearch.questions.attack.carry_out import parts_in, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import PARTS, RunDirectory
-from advsearch.runs.images import read_png
+from advsearch.runs.files import read_png
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.scene.geometry import camera_to_world
 

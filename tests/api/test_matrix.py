@@ -16,7 +16,7 @@ from torch import Tensor
 import advsearch
 from advsearch.attacks import get_objective
 from advsearch.cli.main import main
-from advsearch.engine.objective import of_ensemble
+from advsearch.engine.judging import of_ensemble
 from advsearch.engine.verifier import Retrials
 from advsearch.errors import InputError
 from advsearch.questions.attack import attack

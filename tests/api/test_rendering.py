@@ -15,8 +15,8 @@ import torch
 import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import InputError
-from advsearch.report.marks import GAP, LINE, NARROWEST, columns_for, contact_sheet
-from advsearch.runs.images import read_png
+from advsearch.report.figures import GAP, LINE, NARROWEST, columns_for, contact_sheet
+from advsearch.runs.files import read_png
 from advsearch.scene.color import linear_to_srgb
 
 SMALL = ["--resolution", "16", "--spp", "1", "--quiet"]

@@ -33,7 +33,7 @@ from advsearch.controls.texture import TextureControl
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
-from advsearch.questions.attack import session as attacking
+from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.wording import objective_text

@@ -30,13 +30,12 @@ from advsearch.attacks import (
 from advsearch.attacks.domain import project_l2_box
 from advsearch.attacks.evaluation import one_thread
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.controls.base import Parameter
+from advsearch.controls.base import Parameter, read, to_unit, to_value
 from advsearch.controls.ranges import Range
-from advsearch.controls.values import read, to_unit, to_value
 from advsearch.files import JsonObject
 from advsearch.models import load_model
 from advsearch.models.model import Model, Preprocessing
-from advsearch.questions.stability.stiff import condition_number, hessian
+from advsearch.questions.stability.scenes import condition_number, hessian
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.formation import to_8_bit
 from advsearch.tasks import Classification, Judgement, Prediction

@@ -30,7 +30,7 @@ from advsearch.attacks.objective_functions import (
     targeted_margin,
 )
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective, objective_summaries
-from advsearch.engine import objective
+from advsearch.engine import judging
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import load_model
 from advsearch.tasks import Classification
@@ -489,8 +489,8 @@ def test_rows_may_have_right_labels_of_their_own() -> None:
 
 def test_the_losses_of_colours_are_those_of_the_print_terms() -> None:
     colors = torch.rand(2, 5, 5, 3, generator=torch.Generator().manual_seed(0))
-    assert losses.total_variation(colors).tolist() == [float(objective.variation(one)) for one in colors]
-    assert losses.non_printability(colors).tolist() == [float(objective.off_print(one)) for one in colors]
+    assert losses.total_variation(colors).tolist() == [float(judging.variation(one)) for one in colors]
+    assert losses.non_printability(colors).tolist() == [float(judging.off_print(one)) for one in colors]
     assert losses.total_variation(colors[0]).shape == (1,)
     ink = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
     leaf = torch.full((1, 2, 2, 3), 0.25, requires_grad=True)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from advsearch.attacks import Ending
-from advsearch.attacks.rate_samples import CONDITIONS, OVER_LADDER, affordable, choose_rate_spp, moved
+from advsearch.attacks.trials import CONDITIONS, OVER_LADDER, affordable, choose_rate_spp, moved
 from advsearch.attacks.verification import TRIAL_LOOKS
 
 

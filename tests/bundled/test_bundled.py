@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from advsearch.bundled.objects import HOUSEHOLD, OBJECTS, STREET
-from advsearch.bundled.objects.carving import carved
 from advsearch.bundled.objects.draw import Draw
-from advsearch.bundled.objects.shapes import grid
+from advsearch.bundled.objects.shapes import carved, grid
 from advsearch.errors import UnknownNameError
 from advsearch.scene import library
 from advsearch.scene.assets import Mesh, ObjectAsset, normalised

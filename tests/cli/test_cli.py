@@ -25,9 +25,8 @@ import advsearch
 from advsearch import __version__
 from advsearch.cli import doctor
 from advsearch.cli import show as names
-from advsearch.cli.commands import COMMANDS, help_of
 from advsearch.cli.flags import with_flags
-from advsearch.cli.main import main
+from advsearch.cli.main import COMMANDS, help_of, main
 from advsearch.cli.output import aligned, finish
 from advsearch.cli.output import shown_text as text_of
 from advsearch.controls.base import Choice

@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from advsearch.cli.main import main
-from advsearch.cli.output import escaped, shortened
+from advsearch.cli.output import shortened
 from advsearch.errors import FileFormatError
 from advsearch.models import read_labels
+from advsearch.progress import escaped
 from advsearch.settings import parse_assignment, read_yaml
 from advsearch.yaml_text import parse_yaml
 

@@ -19,9 +19,8 @@ from stored_sweeps import make_sweep
 
 import advsearch
 from advsearch import testing
-from advsearch.cli.commands import COMMANDS
 from advsearch.cli.dashboard import _LoadedLater as TakenLater
-from advsearch.cli.main import main
+from advsearch.cli.main import COMMANDS, main
 from advsearch.cluster import Work
 from advsearch.cluster.worker import Failure, Files, prepare, version
 from advsearch.errors import InputError

@@ -20,8 +20,7 @@ import pytest
 from conftest import ROOT
 
 from advsearch.cluster import Executor, SchedulerGoneError, Work, WorkerDiedError
-from advsearch.cluster.dask_pool import CLASSES, DaskPool, executor_of, site_of
-from advsearch.cluster.local_pool import LocalPool
+from advsearch.cluster.dask_pool import CLASSES, DaskPool, LocalPool, executor_of, site_of
 from advsearch.errors import ClusterError, FileFormatError, InputError
 
 psutil: Any = import_module("psutil")  # which Dask brings along
@@ -93,7 +92,7 @@ with executor_of(Work("cluster_work:squares", {"seconds": 600.0}), workers=1, cl
 def test_a_worker_has_no_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A module that asks as it is imported, here by a worker, is told what to do."""
     monkeypatch.syspath_prepend(str(tmp_path))
-    asks = "from advsearch.cluster.local_pool import LocalPool\nLocalPool(2)\n"
+    asks = "from advsearch.cluster.dask_pool import LocalPool\nLocalPool(2)\n"
     (tmp_path / "asking.py").write_text(asks)
     with executor_of(Work("asking:work", {}), workers=1, cluster=None, tell=print) as executor:
         assert executor is not None

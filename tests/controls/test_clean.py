@@ -13,8 +13,8 @@ import advsearch
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
 from advsearch.controls import Space, make_control, make_space
+from advsearch.controls.base import sentences
 from advsearch.controls.pose import PoseControl
-from advsearch.controls.values import sentences
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep.carry_out import sweep_from_config

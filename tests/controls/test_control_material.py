@@ -10,8 +10,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls.material import NUMBERS, MaterialControl
-from advsearch.controls.material_patterns import PATTERNS, SIDE, covering, tile
+from advsearch.controls.material import NUMBERS, PATTERNS, SIDE, MaterialControl, covering, tile
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Material
 from advsearch.scene.color import srgb_to_linear

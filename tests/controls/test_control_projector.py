@@ -14,14 +14,14 @@ from samples import make_attacked
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.projection import write_projection
+from advsearch.api.export import write_projection
 from advsearch.controls import make_control
 from advsearch.controls.projector import AMBIENT, ProjectorControl, ambient_irradiance
 from advsearch.controls.space import Space
 from advsearch.engine.gradients import inside
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.runs.images import read_png, write_png
+from advsearch.runs.files import read_png, write_png
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world, middle

@@ -24,7 +24,7 @@ from advsearch.controls.sky import (
 )
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.exposure import irradiance
+from advsearch.scene.formation import irradiance
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 

@@ -14,7 +14,7 @@ from scipy import stats
 from torch.distributions import Beta, Exponential, Gumbel, Kumaraswamy, LogNormal, Normal, Uniform
 from torch.distributions import Laplace as TorchLaplace
 
-from advsearch.attacks.draws import Draws
+from advsearch.attacks.domain import Draws
 from advsearch.controls import CameraControl, EnvironmentControl, PatchControl
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.ranges import DrawnRange

@@ -20,7 +20,7 @@ import advsearch
 from advsearch.api.export import printable
 from advsearch.cli.main import main
 from advsearch.controls import make_control, make_space
-from advsearch.engine.objective import off_print, variation
+from advsearch.engine.judging import off_print, variation
 from advsearch.engine.transport import remark
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset

@@ -297,7 +297,7 @@ UNTOUCHED: dict[Any, set[str]] = {
     NumberControl: {
         *("declared", "setting", "settings", "chosen_form", "mesh_in", "within", "allowed", "searches", "in_scene"),
         *("default", "unchanged", "size", "spec", "search_range", "budget_of", "estimators", "left_out", "values"),
-        "later",
+        *("later", "named"),
     },
 }
 """Methods that get no tensors which anybody else reads; those of a declaration get the control's copy of a scene."""

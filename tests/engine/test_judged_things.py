@@ -13,8 +13,8 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.tasks.base import Facts, Sight
-from advsearch.tasks.each_thing import each_thing
 from advsearch.tasks.segmentation import Segmentation
+from advsearch.tasks.together import each_thing
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

@@ -16,7 +16,7 @@ from advsearch.controls.path import PathControl
 from advsearch.engine.loading import as_controls, make_renderer
 from advsearch.errors import InputError
 from advsearch.scene.description import describe
-from advsearch.scene.moments import Moment, moments_of
+from advsearch.scene.formation import Moment, moments_of
 from advsearch.scene.renderer import Renderer
 
 SIDE, SECONDS = 48, 2.0

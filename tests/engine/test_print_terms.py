@@ -12,7 +12,7 @@ from small_models import easy
 
 import advsearch
 from advsearch.cli.output import shown_text as text_of
-from advsearch.engine.objective import off_print, variation
+from advsearch.engine.judging import off_print, variation
 from advsearch.engine.record import Stages
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import attack_once

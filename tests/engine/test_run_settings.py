@@ -17,7 +17,7 @@ from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, given_to
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.attack import session as attacking
+from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.gap import GapConfig, gap
 from advsearch.questions.sweep.carry_out import job_of

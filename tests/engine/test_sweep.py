@@ -31,23 +31,21 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks import clopper_pearson
-from advsearch.attacks.draws import NET, Draws, Product, Seeds, batches
-from advsearch.cli.commands import QuestionCommand
+from advsearch.attacks.domain import NET, Draws, Product, Seeds, batches
 from advsearch.cli.flags import READERS, help_text, with_flags
-from advsearch.cli.main import main
+from advsearch.cli.main import QuestionCommand, main
 from advsearch.cli.output import shown_text as text_of
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
-from advsearch.engine.objective import domain_of
+from advsearch.engine.judging import domain_of
 from advsearch.errors import AdvsearchError, InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep import job as swept_scene
-from advsearch.questions.sweep.axes import axis_values, on_grid, read_axes
+from advsearch.questions.sweep.axes import Points, axis_values, on_grid, parts_of_ranges, read_axes
 from advsearch.questions.sweep.carry_out import job_of, sweep_from_config
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.loop import Sweep
-from advsearch.questions.sweep.points import Points, parts_of_ranges
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.wording import formation_text

@@ -9,7 +9,7 @@ import pytest
 from stand_ins import rows
 
 import advsearch
-from advsearch.attacks.draws import Product
+from advsearch.attacks.domain import Product
 from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation
 from advsearch.questions.sweep import predicting

@@ -12,7 +12,7 @@ import torch
 from stand_ins import rows
 
 import advsearch
-from advsearch.attacks.draws import Product
+from advsearch.attacks.domain import Product
 from advsearch.cluster import Done, Workforce
 from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation

@@ -297,8 +297,8 @@ def warm_up(loaders: Iterable[str]) -> None:
         advsearch.load_scene("book").renderer("texture", resolution=16)
         from PIL import Image
 
-        import advsearch.scene.environments
         import advsearch.scene.importing.objects
+        import advsearch.scene.library
         import advsearch.scene.mitsuba_backend.scene_files
 
         Image.init()

@@ -20,7 +20,7 @@ from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.zoo import language
 from advsearch.models.zoo import transformers as own
-from advsearch.runs.images import read_png
+from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import FreeAnswer
 

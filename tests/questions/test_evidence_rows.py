@@ -17,13 +17,13 @@ from advsearch.attacks import clopper_pearson
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.explain.result import ExplainResult
-from advsearch.questions.report.engineering import (
+from advsearch.questions.report.evidence import (
+    claims_of,
     criterion_lines,
     met,
     read_exposure,
     triggering_conditions,
 )
-from advsearch.questions.report.evidence import claims_of
 from advsearch.report.wording import interval_text, percent
 from advsearch.runs.store import NAME, Store
 

@@ -20,7 +20,7 @@ from advsearch.models.reference import trainable
 from advsearch.questions.harden.detectors import DetectorCourse, Example, own_loss, read_coco
 from advsearch.questions.harden.result import HardenConfig
 from advsearch.questions.harden.scenes import SceneWork
-from advsearch.runs.images import write_png
+from advsearch.runs.files import write_png
 from advsearch.tasks import make_task
 from advsearch.tasks.boxes import Place
 

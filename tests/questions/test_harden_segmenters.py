@@ -13,10 +13,9 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.errors import InputError
 from advsearch.models.reference import trainable
-from advsearch.questions.harden.detectors import Example
+from advsearch.questions.harden.detectors import Example, SegmenterCourse, pixel_loss
 from advsearch.questions.harden.result import HardenConfig
 from advsearch.questions.harden.scenes import SceneWork
-from advsearch.questions.harden.segmenters import SegmenterCourse, pixel_loss
 from advsearch.tasks import make_task
 from advsearch.tasks.segmentation import Region, Segmentation
 

@@ -10,7 +10,7 @@ import small_models
 
 import advsearch
 from advsearch.attacks import clopper_pearson
-from advsearch.questions.report.engineering import conditions_of
+from advsearch.questions.report.evidence import conditions_of
 from advsearch.questions.sweep.display import distance_of
 from advsearch.questions.sweep.result import Predictions
 from advsearch.runs.summary import read_result

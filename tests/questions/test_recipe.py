@@ -25,12 +25,12 @@ from advsearch.questions.recipe import carry_out as carrying_out
 from advsearch.questions.recipe import recipe as asked
 from advsearch.questions.recipe.carry_out import FIGURES, check_figures, files_of, make, read_options
 from advsearch.questions.recipe.description import Recipe, planned, read_recipe, recipe_names, titles
-from advsearch.questions.recipe.frame import MadeFigure, Rows, Tally, frame_of
 from advsearch.questions.recipe.given import CuesOptions, all_triangles, fitting, predicted, triangle_of
+from advsearch.questions.recipe.rates import MadeFigure, Rows, Tally, frame_of
 from advsearch.questions.recipe.result import RecipeConfig, RecipeFigure, RecipeResult, told_once
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SurfaceMap
-from advsearch.runs.images import write_png
+from advsearch.runs.files import write_png
 from advsearch.runs.summary import read_result
 
 SCENES = Path(__file__).resolve().parents[2] / "advsearch/bundled/data/environments"

@@ -16,7 +16,7 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.recipe.result import RecipeConfig
 from advsearch.questions.report.evidence import QUICK
 from advsearch.runs.directory import PARTS, RunDirectory
-from advsearch.runs.images import write_png
+from advsearch.runs.files import write_png
 from advsearch.runs.summary import MADE_WITH, file_digests
 
 

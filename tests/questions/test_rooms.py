@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import advsearch
-from advsearch import rooms
+from advsearch import registry
 from advsearch.settings import HEADER
 
 GONE = ("recipe", "harden", "stability")
@@ -47,8 +47,8 @@ def test_without_the_folders_of_three_questions_the_tool_works(tmp_path: Path) -
 
 
 def test_every_room_has_what_finds_it() -> None:
-    for name in rooms.rooms():
-        room = rooms.Room(name)
+    for name in registry.rooms():
+        room = registry.Room(name)
         if room.config is not None:
             assert room.config.command == name and room.result.command == name
             assert room.from_config is not None

@@ -15,8 +15,7 @@ from covering import only
 
 from advsearch.cli.main import main
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.stability import carry_out as suite
-from advsearch.questions.stability.carry_out import chosen
+from advsearch.questions.stability import scenes as suite
 from advsearch.questions.stability.result import (
     CASES,
     FELL_SHORT,
@@ -29,7 +28,7 @@ from advsearch.questions.stability.result import (
     check,
     holds,
 )
-from advsearch.questions.stability.stiff import condition_number, hessian
+from advsearch.questions.stability.scenes import chosen, condition_number, hessian
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.summary import read_result
 

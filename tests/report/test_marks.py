@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 import torch
 
-from advsearch.report.marks import SAID, SMALLEST, TINT, TRUE, marked
+from advsearch.report.figures import SAID, SMALLEST, TINT, TRUE, marked
 from advsearch.report.wording import calling, calls, margin_text, marks_text, prediction_cells, prediction_text, wanted
 from advsearch.tasks import Mark, Prediction
 

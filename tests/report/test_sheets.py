@@ -18,7 +18,7 @@ from advsearch.api.export import printable
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError
 from advsearch.report.sheets import MARGIN, PAPERS, Piece, pages_of, write_sheets
-from advsearch.runs.images import read_png, to_8bit
+from advsearch.runs.files import read_png, to_8bit
 
 POINT = 25.4 / 72.0
 """Millimetres."""

@@ -21,8 +21,7 @@ from advsearch.described import Value
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.runs import summary
 from advsearch.runs.directory import RunDirectory, find_run
-from advsearch.runs.files import write_text
-from advsearch.runs.images import read_png
+from advsearch.runs.files import read_png, write_text
 from advsearch.runs.listing import listed_run
 from advsearch.runs.results import Result
 from advsearch.runs.store import Row, Store, Told

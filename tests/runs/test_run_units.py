@@ -12,7 +12,7 @@ import pytest
 from advsearch.errors import FileFormatError
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
-from advsearch.runs.units import NOTE, Units, units_of
+from advsearch.runs.tables import NOTE, Units, units_of
 
 
 @pytest.mark.parametrize("frames", [0, 1, 2])

@@ -32,7 +32,7 @@ from advsearch.errors import FileFormatError, InputError, RunExistsError, Storag
 from advsearch.files import open_regular
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.runs import directory, images, summary
+from advsearch.runs import directory, files, summary
 from advsearch.runs.directory import RunDirectory, default_name, find_run, run_path
 from advsearch.runs.export import FORMATS, write_rows
 from advsearch.runs.files import PART, VERSION, RunLock, replacing, write_bytes, write_text
@@ -531,7 +531,7 @@ def test_an_exr_that_does_not_fit_is_said(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(OpenEXR, "File", Full)
     with pytest.raises(StorageError, match=r"cannot write .*clean\.exr: the disk is full"):
-        images.write_exr(tmp_path / "clean.exr", np.zeros((4, 4, 3)))
+        files.write_exr(tmp_path / "clean.exr", np.zeros((4, 4, 3)))
     assert not list(tmp_path.iterdir())
 
 
@@ -542,33 +542,33 @@ def test_an_exr_that_does_not_fit_is_said(tmp_path: Path, monkeypatch: pytest.Mo
 @settings(max_examples=50, deadline=None)
 def test_eight_bits_round_as_verification_does(values: list[float]) -> None:
     expected = [round(float(np.float32(min(max(value, 0.0), 1.0)) * np.float32(255.0))) for value in values]
-    assert images.to_8bit(np.array(values, dtype=np.float32)).tolist() == expected
+    assert files.to_8bit(np.array(values, dtype=np.float32)).tolist() == expected
 
 
 def test_halves_go_to_even_and_nan_to_black() -> None:
     halves = (np.array([0.5, 1.5, 2.5, 3.5], dtype=np.float32)) / np.float32(255.0)
     scaled = halves * np.float32(255.0)
-    assert images.to_8bit(halves).tolist() == [round(float(one)) for one in scaled]
-    assert images.to_8bit(np.array([np.nan, np.inf, -np.inf])).tolist() == [0, 255, 0]
+    assert files.to_8bit(halves).tolist() == [round(float(one)) for one in scaled]
+    assert files.to_8bit(np.array([np.nan, np.inf, -np.inf])).tolist() == [0, 255, 0]
 
 
 def test_png_round_trip_and_equal_bytes(tmp_path: Path) -> None:
     image = np.random.default_rng(0).random((5, 7, 3), dtype=np.float32)
-    path = images.write_png(tmp_path / "image.png", image)
-    assert path.read_bytes() == images.png_bytes(image.copy())
-    np.testing.assert_array_equal(images.to_8bit(images.read_png(path)), images.to_8bit(image))
-    assert images.read_png(images.write_png(tmp_path / "grey.png", image[..., :1])).shape == (5, 7, 3)
+    path = files.write_png(tmp_path / "image.png", image)
+    assert path.read_bytes() == files.png_bytes(image.copy())
+    np.testing.assert_array_equal(files.to_8bit(files.read_png(path)), files.to_8bit(image))
+    assert files.read_png(files.write_png(tmp_path / "grey.png", image[..., :1])).shape == (5, 7, 3)
     with pytest.raises(ValueError, match=r"expected a picture of shape \(H, W, 3\) or \(H, W\), got \(5, 7, 4\)"):
-        images.png_bytes(np.zeros((5, 7, 4)))
+        files.png_bytes(np.zeros((5, 7, 4)))
 
 
 def test_exr_round_trip_is_exact_and_equal_bytes(tmp_path: Path) -> None:
     image = np.random.default_rng(0).normal(scale=1e4, size=(5, 7, 3)).astype(np.float32)
     image[0, 0] = np.inf, -0.0, np.nan
-    first, second = (images.write_exr(tmp_path / f"{name}.exr", image) for name in "ab")
+    first, second = (files.write_exr(tmp_path / f"{name}.exr", image) for name in "ab")
     np.testing.assert_array_equal(exr(first), image)
     assert first.read_bytes() == second.read_bytes()
-    grey = images.write_exr(tmp_path / "grey.exr", image[..., 1])
+    grey = files.write_exr(tmp_path / "grey.exr", image[..., 1])
     np.testing.assert_array_equal(exr(grey), image[..., 1])
 
 
@@ -577,15 +577,15 @@ def test_what_is_no_picture_is_refused(tmp_path: Path) -> None:
         if content is not None:
             (tmp_path / "x").write_bytes(content)
         with pytest.raises(FileFormatError, match="x: expected a PNG picture"):
-            images.read_png(tmp_path / "x")
+            files.read_png(tmp_path / "x")
 
 
 def test_the_difference_is_grey_where_nothing_changed() -> None:
     before = np.full((2, 2, 3), 0.5)
     after = before.copy()
     after[0, 0] = 0.54
-    found = images.difference(before, after)
-    np.testing.assert_allclose(found[0, 0], 0.5 + images.DIFFERENCE_GAIN * 0.04, rtol=1e-5)
+    found = files.difference(before, after)
+    np.testing.assert_allclose(found[0, 0], 0.5 + files.DIFFERENCE_GAIN * 0.04, rtol=1e-5)
     assert (found[1] == 0.5).all()
 
 
@@ -594,24 +594,24 @@ def test_an_animation_is_small_and_holds_its_last_frame(run: RunDirectory) -> No
     path = run.save_animation("search", frames)
     shown = iio.imread(path)
     assert path == run.path / "images" / "search.gif"
-    assert len(shown) <= images.ANIMATION_FRAMES
+    assert len(shown) <= files.ANIMATION_FRAMES
     assert shown[0].mean() < 8 and shown[-1].mean() > 247
     durations = [iio.immeta(path, index=number)["duration"] for number in range(len(shown))]
-    assert sum(durations) == (images.ANIMATION_FRAMES - 1) * images.FRAME_MS + images.LAST_FRAME_MS
-    assert durations[0] == images.FRAME_MS and durations[-1] >= images.LAST_FRAME_MS
+    assert sum(durations) == (files.ANIMATION_FRAMES - 1) * files.FRAME_MS + files.LAST_FRAME_MS
+    assert durations[0] == files.FRAME_MS and durations[-1] >= files.LAST_FRAME_MS
 
 
 @pytest.mark.parametrize("limit", [150_000, 20_000])
 def test_noise_still_fits(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
     noise = np.random.default_rng(0).random((24, 96, 96, 3))
-    monkeypatch.setattr(images, "ANIMATION_BYTES", limit)
-    assert limit / 4 < len(images.animation_bytes(list(noise))) <= limit
+    monkeypatch.setattr(files, "ANIMATION_BYTES", limit)
+    assert limit / 4 < len(files.animation_bytes(list(noise))) <= limit
 
 
 def test_large_and_single_frames_become_animations() -> None:
-    large = iio.imread(images.animation_bytes([np.zeros((700, 900, 3))] * 2), extension=".gif")
+    large = iio.imread(files.animation_bytes([np.zeros((700, 900, 3))] * 2), extension=".gif")
     assert large.shape[1:] == (233, 300, 3)
-    assert iio.imread(images.animation_bytes([np.ones((9, 9, 3))]), extension=".gif").min() == 255
+    assert iio.imread(files.animation_bytes([np.ones((9, 9, 3))]), extension=".gif").min() == 255
 
 
 def test_an_array_that_needs_its_gradient_detached() -> None:
@@ -622,7 +622,7 @@ def test_an_array_that_needs_its_gradient_detached() -> None:
         def cpu(self) -> Any:
             return np.full((1, 1, 3), 0.25)
 
-    assert images.to_8bit(Tensor()).tolist() == [[[64, 64, 64]]]
+    assert files.to_8bit(Tensor()).tolist() == [[[64, 64, 64]]]
 
 
 # ---- the summary ----

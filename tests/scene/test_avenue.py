@@ -12,8 +12,7 @@ from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.grounds import LUMINANCE, enclosed, paved
 from advsearch.scene.places.avenue import AVENUE, END, KERB, LAMP_HEIGHT, lamp_places
 from advsearch.scene.places.paint import FRONTS
-from advsearch.scene.places.quads import SHOWN, Quads, Wall
-from advsearch.scene.places.road import KERBS, ROAD
+from advsearch.scene.places.quads import KERBS, ROAD, SHOWN, Quads, Wall
 
 
 def laid(scene: SceneDescription) -> set[str]:

@@ -12,7 +12,7 @@ from advsearch.controls.camera import ROAD_USERS, CameraControl
 from advsearch.controls.path import PathControl
 from advsearch.engine.loading import Scene, load_scene, scene_as_settings
 from advsearch.errors import InputError
-from advsearch.scene.camera_presets import PRESETS
+from advsearch.scene.camera_entries import PRESETS
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.validity import view_of

@@ -22,8 +22,7 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription, describe
-from advsearch.scene.exposure import irradiance
-from advsearch.scene.formation import EVERYTHING
+from advsearch.scene.formation import EVERYTHING, irradiance
 from advsearch.scene.glb import glb, posed
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.mitsuba_backend.meshes import sampling_weights

@@ -12,7 +12,7 @@ import OpenEXR
 import pytest
 
 from advsearch.errors import FileFormatError, InputError
-from advsearch.scene.environments import import_environment
+from advsearch.scene.library import import_environment
 
 DATA = conftest.DATA / "environments"
 real_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the shared test data is not at {DATA}")

@@ -17,7 +17,14 @@ from advsearch.engine.loading import Scene, load_scene
 from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Material
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.exposure import METERED_WHITE, WHITE, irradiance, metered_gain, visible_irradiance, visible_normals
+from advsearch.scene.formation import (
+    METERED_WHITE,
+    WHITE,
+    irradiance,
+    metered_gain,
+    visible_irradiance,
+    visible_normals,
+)
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import resolve
 

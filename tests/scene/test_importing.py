@@ -1321,7 +1321,7 @@ def test_lights_and_cameras_beside_a_whole_object_are_named(tmp_path: Path) -> N
 
 
 def test_importing_does_not_pull_in_the_renderer() -> None:
-    code = "import sys, advsearch.scene.importing.objects, advsearch.scene.environments as e\n"
+    code = "import sys, advsearch.scene.importing.objects, advsearch.scene.library as e\n"
     code += "print({'mitsuba', 'torch'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -10,6 +10,7 @@ import torch
 
 import advsearch
 from advsearch.scene import outlines
+from advsearch.scene.geometry import projected
 from advsearch.scene.outlines import SeenThing, seen_things
 from advsearch.scene.renderer import Renderer
 
@@ -47,7 +48,7 @@ def test_a_lens_bends_the_outline() -> None:
 
 
 def test_an_outline_that_is_elsewhere_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
-    places = outlines.projected
+    places = projected
     one = renderer({"pose": {}}, 60.0, SIDE)
     assert seen(one).share == pytest.approx(1.0, abs=0.01)
 

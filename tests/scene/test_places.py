@@ -11,9 +11,9 @@ from advsearch.scene import library
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import standing
 from advsearch.scene.grounds import LUMINANCE, enclosed, paved
-from advsearch.scene.places import car_park, crossing, room
-from advsearch.scene.places.avenue import KERB, Place, lamp_places
-from advsearch.scene.places.road import FLOOR, ROAD
+from advsearch.scene.places import crossing, room
+from advsearch.scene.places.avenue import KERB, StreetPlan, lamp_places
+from advsearch.scene.places.quads import FLOOR, ROAD
 from advsearch.scene.things import footprint, overlapping
 
 pytestmark = pytest.mark.usefixtures("two_threads")
@@ -70,8 +70,8 @@ def test_below_the_horizon_there_is_ground_all_around(place: str) -> None:
         assert float(seen.depth.max()) < 5.0
 
 
-@pytest.mark.parametrize("plan", [crossing.CROSSING, car_park.CAR_PARK])
-def test_posts_and_trees_stand_on_pavements_or_between_bays(plan: Place) -> None:
+@pytest.mark.parametrize("plan", [crossing.CROSSING, crossing.CAR_PARK])
+def test_posts_and_trees_stand_on_pavements_or_between_bays(plan: StreetPlan) -> None:
     lamps = lamp_places(plan.posts)
     assert (np.hypot(lamps[:, 0], lamps[:, 1]) > 4.0).all()
     if plan is crossing.CROSSING:
@@ -101,9 +101,9 @@ def test_the_crossing_has_a_stop_sign_that_faces_who_comes_and_a_zebra_ahead() -
 def test_a_bay_is_as_large_as_bays_are_and_the_car_is_in_one() -> None:
     scene = describe("car", "car-park")
     car = footprint(scene.base_vertices * scene.metres)
-    assert np.abs(car.outline[:, 0]).max() < car_park.DEEP / 2.0 and np.abs(car.outline[:, 1]).max() < 1.2
-    row = min(car_park.ROWS, key=abs)
-    assert row == -car_park.DEEP / 2.0
+    assert np.abs(car.outline[:, 0]).max() < crossing.DEEP / 2.0 and np.abs(car.outline[:, 1]).max() < 1.2
+    row = min(crossing.ROWS, key=abs)
+    assert row == -crossing.DEEP / 2.0
     neighbour = describe("car", "car-park", things="car@0,2.5")
     beside = footprint(standing(neighbour.meshes["car"]) * neighbour.metres)
     assert not overlapping(car, beside) and not any("stand in" in one for one in neighbour.notes)

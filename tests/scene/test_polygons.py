@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from advsearch.scene.importing import polygons
-from advsearch.scene.importing.polygons import triangulated
+from advsearch.scene.importing import geometry
+from advsearch.scene.importing.geometry import triangulated
 
 
 def doubled(corners: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ def test_what_crosses_itself_is_counted_and_work_has_an_end(monkeypatch: pytest.
     triangles, _, wrong = triangulated(star, np.array([5]))
     assert triangles.shape == (3, 3) and wrong in (0, 1)
     wild = np.random.default_rng(0).normal(size=(400, 3))
-    monkeypatch.setattr(polygons, "MOST_WORK", 1000)
+    monkeypatch.setattr(geometry, "MOST_WORK", 1000)
     triangles, owner, wrong = triangulated(wild, np.array([200, 200]))
     assert wrong == 2 and triangles.shape == (396, 3) and np.array_equal(np.bincount(owner), [198, 198])
     assert triangulated(np.full((4, 3), np.nan), np.array([4]))[0].shape == (2, 3)

@@ -11,8 +11,8 @@ import torch
 
 import advsearch
 from advsearch.errors import InputError
+from advsearch.scene.mitsuba_backend.own_plugins import APERTURE, DISTANCE, WATER, raindrops
 from advsearch.scene.mitsuba_backend.variant import mi
-from advsearch.scene.raindrops import APERTURE, DISTANCE, WATER, raindrops
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 SIDE = 64

@@ -11,7 +11,7 @@ import pytest
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.importing.files import Names, Notes
-from advsearch.scene.importing.mtl import map_of
+from advsearch.scene.importing.mtl_surfaces import map_of
 from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.scenes import node_names
 from advsearch.scene.importing.wavefront import MOST_NAMED

@@ -11,7 +11,7 @@ import torch
 
 from advsearch.engine.loading import load_scene
 from advsearch.errors import UnknownNameError
-from advsearch.runs.images import write_layers
+from advsearch.runs.files import write_layers
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.surfaces import AOVS, CHANNELS, Surfaces, aovs_of
 

@@ -11,7 +11,7 @@ from test_gltf import File
 from test_wavefront import MAPPED, USED, areas, picture, read
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing import udim
+from advsearch.scene.importing import mtl_surfaces
 from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.parts import holds_normals
 from advsearch.scene.importing.texture import mean_over
@@ -80,15 +80,15 @@ def test_one_picture_with_a_number_in_its_name_repeats_and_is_said(tmp_path: Pat
     ],
 )
 def test_numbers_in_names(name: str, number: int | None) -> None:
-    assert udim.number_in(name) == number
+    assert mtl_surfaces.number_in(name) == number
     if number is not None:
-        assert udim.named(name, 1013) in ("a.1013.png", "a1013.exr", "a1013.png")
+        assert mtl_surfaces.named(name, 1013) in ("a.1013.png", "a1013.exr", "a1013.png")
 
 
 def test_squares_are_numbered_as_udim_has_them() -> None:
     at = np.array([[0.5, 0.5], [9.5, 0.5], [0.5, 1.5], [2.5, 3.5], [-0.5, 0.5], [10.5, 0.5]])
-    assert udim.squares(at[:, None].repeat(3, axis=1)).tolist() == [1001, 1010, 1011, 1033, 0, 0]
-    assert [udim.corner_of(one) for one in (1001, 1010, 1033, 0)] == [(0, 0), (9, 0), (2, 3), (0, 0)]
+    assert mtl_surfaces.squares(at[:, None].repeat(3, axis=1)).tolist() == [1001, 1010, 1011, 1033, 0, 0]
+    assert [mtl_surfaces.corner_of(one) for one in (1001, 1010, 1033, 0)] == [(0, 0), (9, 0), (2, 3), (0, 0)]
 
 
 # ---- faces of one and two corners -----------------------------------------------------------------------------------

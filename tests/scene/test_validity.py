@@ -13,7 +13,7 @@ from advsearch.engine.loading import Scene, framed, load_scene
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.library import load_environment, load_object
-from advsearch.scene.places.road import EDGES, EYE, LENGTH
+from advsearch.scene.places.quads import EDGES, EYE, LENGTH
 from advsearch.scene.validity import CameraView, Surroundings, past, surroundings_of, valid, view_of
 
 SIDE = 96

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.mtl import map_of
+from advsearch.scene.importing.mtl_surfaces import map_of
 from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.parts import ImportedPart
 

@@ -19,7 +19,7 @@ from advsearch.attacks.objectives import get_objective
 from advsearch.cli.main import main
 from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
-from advsearch.runs.images import read_png
+from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Depth, Facts, Sight, make_task
 from advsearch.tasks.depth import AS_FAR, DISPARITY, FARTHER, GONE, METRIC, NEARER, OUT_OF_SHAPE, RELATIVE, Distances

@@ -18,7 +18,7 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.questions.photographs.carry_out import Photographs
 from advsearch.questions.photographs.result import rendering_file
-from advsearch.runs.images import read_png
+from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Detection
 

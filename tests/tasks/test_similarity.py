@@ -20,7 +20,7 @@ from advsearch.attacks.objectives import check_objective, get_objective
 from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch.models import Model, ModelWarning
-from advsearch.runs.images import read_png, to_8bit
+from advsearch.runs.files import read_png, to_8bit
 from advsearch.runs.summary import file_digests
 from advsearch.tasks import Facts, Similarity, make_task
 from advsearch.tasks.similarity import ELSE, ITSELF, TEMPERATURE

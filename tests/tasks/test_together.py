@@ -13,11 +13,11 @@ from torch import nn
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.engine.objective import objective_for
+from advsearch.engine.judging import objective_for
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.runs.images import read_png
+from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Depth, Detection, Facts, Segmentation, Sight, Task, make_task
 from advsearch.tasks.depth import AS_FAR, DISPARITY, GONE

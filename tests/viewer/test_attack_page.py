@@ -34,11 +34,10 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
 from advsearch.questions.attack import wording
 from advsearch.report.figures import search_axes
-from advsearch.report.markup import NARROW, WIDE, Html, element, join_html, result_figure, study_chart
-from advsearch.report.shown import shown
+from advsearch.report.shown import NARROW, WIDE, Html, element, join_html, result_figure, shown, study_chart
 from advsearch.report.wording import interval_text, objective_label, percent, seconds_text
 from advsearch.runs.directory import OBJECT_FILE
-from advsearch.runs.images import read_png
+from advsearch.runs.files import read_png
 from advsearch.viewer.document import asset
 from advsearch.viewer.pages import LARGE_PICTURE, LARGEST, SMALLER_SIDE, object_part, read_object
 
@@ -236,7 +235,7 @@ def test_a_large_picture_is_embedded_smaller(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
     large = run / "artifacts" / "texture.png"
     noise = np.random.default_rng(0).random((700, 700, 3))
-    from advsearch.runs.images import write_png
+    from advsearch.runs.files import write_png
 
     write_png(large, noise)
     assert large.stat().st_size > LARGE_PICTURE

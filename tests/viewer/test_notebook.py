@@ -20,7 +20,7 @@ from advsearch.questions.attack.summary import CurveResult
 from advsearch.questions.gap import GapResult
 from advsearch.questions.sweep.figures import sweep_axes
 from advsearch.report.figures import search_axes
-from advsearch.report.markup import side_by_side
+from advsearch.report.shown import side_by_side
 
 NOTEBOOK, LOSSES = ROOT / "docs" / "notebook.ipynb", ROOT / "docs" / "own-loss.ipynb"
 

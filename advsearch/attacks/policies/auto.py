@@ -54,7 +54,7 @@ NEVER = 1 << 30  # renders of a gradient that no search can pay
 
 
 @dataclass(frozen=True)
-class Budget:
+class Spending:
     """What the renders are for: the screen; the ascent, which asks for `gradient`, begins after `until`, or never at
     `steps`."""
 
@@ -64,20 +64,20 @@ class Budget:
     gradient: WhichGradient
 
 
-def make_plan(domain: Domain, box: Coordinates, steps: int) -> Budget:
+def make_plan(domain: Domain, box: Coordinates, steps: int) -> Spending:
     """Return what `steps` renders are for."""
     if box.count == 0:
-        return Budget(steps, 0, 0, True)
+        return Spending(steps, 0, 0, True)
     if box.count < domain.dim:
         screen, until = math.ceil(SCREEN_MIXED * steps), math.ceil(UNTIL_MIXED * steps)
-        return Budget(steps, screen, until, "free" if domain.gradient_cost and domain.partial_gradients else True)
+        return Spending(steps, screen, until, "free" if domain.gradient_cost and domain.partial_gradients else True)
     ways = int((box.options == 0).sum())
     screen = math.ceil(SCREEN * steps * min(1.0, LOW / max(ways, 1)))
     until = math.ceil(UNTIL * steps) if ways <= LOW else screen
     cost = domain.gradient_cost
     if ways and PAYS * cost <= ways and PAYS * (1 + cost) <= steps - until:
-        return Budget(steps, screen, until, True)
-    return Budget(steps, math.ceil(SCREEN * steps), steps, True)
+        return Spending(steps, screen, until, True)
+    return Spending(steps, math.ceil(SCREEN * steps), steps, True)
 
 
 def _pgd(domain: Domain) -> PGD:
@@ -101,7 +101,7 @@ class AutoState:
 
     domain: Domain
     seen: Observed
-    plan: Budget
+    plan: Spending
     seed: int
     screen: Tensor
     spent: int = 0

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from .cars import car
-from .family import Instance, ObjectFamily
-from .furniture import chair, lamp
-from .kitchen import frying_pan, teapot
-from .people import person
-from .signs import stop_sign
-from .things import ball, banana, book
-from .tools import dumbbell, hammer
-from .vessels import bottle, bowl, mug, vase, wine_glass
+from advsearch.bundled.objects.cars import car
+from advsearch.bundled.objects.family import Instance, ObjectFamily
+from advsearch.bundled.objects.furniture import chair, lamp
+from advsearch.bundled.objects.kitchen import frying_pan, teapot
+from advsearch.bundled.objects.people import person
+from advsearch.bundled.objects.things import ball, banana, book, stop_sign
+from advsearch.bundled.objects.tools import dumbbell, hammer
+from advsearch.bundled.objects.vessels import bottle, bowl, mug, vase, wine_glass
 
 _HOUSEHOLD = (
     mug, bowl, bottle, vase, teapot, wine_glass, frying_pan, hammer, banana, ball, chair, lamp, book, dumbbell,

@@ -11,14 +11,30 @@ from itertools import pairwise, product
 
 import numpy as np
 
+from advsearch.bundled.objects.draw import Draw, hexed
+from advsearch.bundled.objects.family import Instance, family
+from advsearch.bundled.objects.shapes import (
+    Array,
+    Field,
+    Patch,
+    away_from,
+    box,
+    cap,
+    carved,
+    grid,
+    lathe,
+    mean_lengths,
+    placed,
+    rectangle,
+    rotation,
+    rounded,
+    spline,
+    stretched,
+    sweep,
+    unit,
+)
+from advsearch.bundled.objects.textures import Paint, Texels, mix, painter, solid, step
 from advsearch.scene.assets import Material
-
-from .carving import Field, carved
-from .curves import Array, away_from, rectangle, rotation, rounded, spline, unit
-from .draw import Draw, hexed
-from .family import Instance, family
-from .shapes import Patch, box, cap, grid, lathe, mean_lengths, placed, stretched, sweep
-from .textures import Paint, Texels, mix, painter, solid, step
 
 AXLES = (1.29, -1.33)
 WHEEL, TYRE = 0.33, 0.215  # radius and width

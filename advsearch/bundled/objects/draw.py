@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from .curves import Array
+from advsearch.bundled.objects.shapes import Array
 
 T = TypeVar("T")
 

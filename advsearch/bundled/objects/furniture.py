@@ -6,11 +6,38 @@ from itertools import product
 
 import numpy as np
 
-from .curves import Array, dense, ellipse, rectangle, rotation, rounded, spline
-from .draw import Draw, hexed
-from .family import Instance, family, finish
-from .shapes import Patch, box, lathe, placed, sphere, sweep
-from .textures import Paint, between, checks, clouded, dots, gradient, natural, over, rings, shade, solid, stripes, wood
+from advsearch.bundled.objects.draw import Draw, hexed
+from advsearch.bundled.objects.family import Instance, family, finish
+from advsearch.bundled.objects.shapes import (
+    Array,
+    Patch,
+    box,
+    dense,
+    ellipse,
+    lathe,
+    placed,
+    rectangle,
+    rotation,
+    rounded,
+    sphere,
+    spline,
+    sweep,
+)
+from advsearch.bundled.objects.textures import (
+    Paint,
+    between,
+    checks,
+    clouded,
+    dots,
+    gradient,
+    natural,
+    over,
+    rings,
+    shade,
+    solid,
+    stripes,
+    wood,
+)
 
 Place = tuple[float, float, float]
 

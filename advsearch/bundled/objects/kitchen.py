@@ -4,11 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 
-from .curves import Array, Points, at_height, ellipse, rectangle, rotation, spline, upright
-from .draw import Draw
-from .family import Instance, family, finish
-from .shapes import Patch, frames, lathe, placed, sphere, sweep, vessel
-from .textures import (
+from advsearch.bundled.objects.draw import Draw
+from advsearch.bundled.objects.family import Instance, family, finish
+from advsearch.bundled.objects.shapes import (
+    Array,
+    Patch,
+    Points,
+    at_height,
+    ellipse,
+    frames,
+    lathe,
+    placed,
+    rectangle,
+    rotation,
+    sphere,
+    spline,
+    sweep,
+    upright,
+    vessel,
+)
+from advsearch.bundled.objects.textures import (
     Paint,
     Texels,
     between,

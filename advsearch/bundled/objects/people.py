@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
+from advsearch.bundled.objects.draw import Draw, hexed
+from advsearch.bundled.objects.family import Instance, family
+from advsearch.bundled.objects.shapes import Array, Patch, Rest
+from advsearch.bundled.objects.textures import Texels, mix, noise, painter, step
 from advsearch.scene.assets import Ints, Material
 from advsearch.scene.people import Person, body_data
-
-from .curves import Array
-from .draw import Draw, hexed
-from .family import Instance, family
-from .shapes import Patch, Rest
-from .textures import Texels, mix, noise, painter, step
 
 FINISHES = {
     "shirt": Material(roughness=0.85, specular=0.2),

@@ -10,11 +10,128 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, pairwise
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from .curves import Array, Points, at_height, dense, lengths, unit
+# ---- Plane and space curves from which the bundled objects are made. Float64; lengths in the object's units ---------
+
+Array: TypeAlias = npt.NDArray[np.float64]
+Points: TypeAlias = Array | Sequence[Sequence[float] | Array]
+
+
+def unit(vectors: Array) -> Array:
+    """Return vectors (..., 3) or (..., 2) scaled to length one; zero vectors stay zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0.0, length, 1.0)
+
+
+def at_height(profile: Array, height: float) -> float:
+    """Return how far from the axis a profile (K, 2) of points (r, z) with rising z is at a height."""
+    return float(np.interp(height, profile[:, 1], profile[:, 0]))
+
+
+def lengths(curve: Array) -> Array:
+    """Return how far along a polyline (K, D) its points are: (K,), from 0."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+
+
+def away_from(x: Array, y: Array, *paths: Points) -> Array:
+    """Return how far points (N,) are from the nearest of some polylines (K, 2)."""
+    away = np.full(len(x), np.inf)
+    for (x0, y0), (x1, y1) in chain.from_iterable(map(pairwise, paths)):
+        dx, dy = x1 - x0, y1 - y0
+        t = np.clip(((x - x0) * dx + (y - y0) * dy) / (dx * dx + dy * dy), 0.0, 1.0)
+        away = np.minimum(away, np.hypot(x - x0 - t * dx, y - y0 - t * dy))
+    return away
+
+
+def upright(curve: Array) -> Array:
+    """Return a plane curve (K, 2) as one (K, 3) in the plane of x and z."""
+    return np.insert(curve, 1, 0.0, axis=1)
+
+
+def rotation(axis: str, degrees: float) -> Array:
+    """Return the (3, 3) right-handed rotation about the axis "x", "y" or "z" by an angle in degrees."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    turn = np.eye(3)
+    turn[i, i] = turn[j, j] = c
+    turn[i, j], turn[j, i] = -s, s
+    return turn
+
+
+def spline(points: Points, count: int) -> Array:
+    """Return `count` points of the Catmull-Rom curve (chord-length knots) through (K, D) points, ends included."""
+    knots = np.asarray(points, dtype=np.float64)
+    at = lengths(knots)
+    slope = np.gradient(knots, at, axis=0)
+    t = np.linspace(0.0, at[-1], count)
+    i = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(knots) - 2)
+    span = (at[i + 1] - at[i])[:, None]
+    x = (t - at[i])[:, None] / span
+    start, end = knots[i], knots[i + 1]
+    first, last = slope[i] * span, slope[i + 1] * span
+    turn = 2 * start - 2 * end + first + last
+    curve: Array = ((turn * x + (3 * end - 3 * start - 2 * first - last)) * x + first) * x + start
+    return curve
+
+
+def rounded(corners: Points, radius: float | Sequence[float], steps: int = 5) -> Array:
+    """Return the open polyline (K, D) with its inner corners rounded off.
+
+    Args:
+        corners: the polyline.
+        radius: how far from each inner corner the rounding starts, one number or K - 2 of them; at most half an edge.
+        steps: edges per rounding.
+    """
+    points = np.asarray(corners, dtype=np.float64)
+    radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), (max(len(points) - 2, 0),))
+    out = [points[0]]
+    for before, corner, after, wanted in zip(points, points[1:], points[2:], radii, strict=False):
+        a, b = before - corner, after - corner
+        reach = min(float(wanted), 0.499 * float(np.linalg.norm(a)), 0.499 * float(np.linalg.norm(b)))
+        if reach <= 1e-9:
+            out.append(corner)
+            continue
+        p, q = corner + unit(a) * reach, corner + unit(b) * reach
+        t = np.linspace(0.0, 1.0, steps + 1)[:, None]
+        out.extend((1 - t) ** 2 * p + 2 * t * (1 - t) * corner + t**2 * q)
+    out.append(points[-1])
+    return np.array(out)
+
+
+def dense(points: Points, longest: float) -> Array:
+    """Return the polyline with edges longer than `longest` cut into equal pieces."""
+    curve = np.asarray(points, dtype=np.float64)
+    out = [curve[:1]]
+    for a, b in pairwise(curve):
+        pieces = max(1, int(np.ceil(round(float(np.linalg.norm(b - a)) / longest, 6))))
+        out.append(a + (b - a) * (np.arange(1, pieces + 1) / pieces)[:, None])
+    return np.concatenate(out)
+
+
+def polygon(sides: int, bevel: float = 0.12, steps: int = 2) -> Array:
+    """Return a regular polygon of circumradius 1, a flat side down, corners rounded: a closed section (M, 2)."""
+    angle = 2 * np.pi * (np.arange(sides + 2) - 0.5) / sides - np.pi / 2
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return rounded(ring, bevel, steps)[1:-1]
+
+
+def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Array:
+    """Return a rounded rectangle, centred, counter-clockwise, as a closed section (M, 2)."""
+    w, h = width / 2, height / 2
+    corners = [(w, -h), (w, h), (-w, h), (-w, -h), (w, -h), (w, h)]
+    return rounded(corners, bevel, steps)[1:-1]
+
+
+def ellipse(width: float, height: float, count: int = 20) -> Array:
+    """Return an ellipse with the given half-axes, counter-clockwise, as a closed section (count, 2)."""
+    t = 2 * np.pi * np.arange(count) / count
+    return np.stack([width * np.cos(t), height * np.sin(t)], axis=1)
+
 
 Indices = npt.NDArray[np.int64]
 Rest = Callable[[Array, Array], Array]
@@ -400,3 +517,98 @@ def _box_line(half: float, bevel: float, steps: int, cells: int) -> Array:
     edge = half - bevel + bevel * angle
     flat = np.linspace(-(half - bevel), half - bevel, cells + 1)
     return np.concatenate([-edge[::-1][:-1], flat, edge[1:]])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Cutting patches along curves: what is carved out of a smooth surface becomes a part with an edge of its own.
+#
+# A curve is where a function of the surface's points is zero. Triangles that it crosses are split there, so that the
+# edge is as smooth as the function and not as coarse as the grid.
+
+Bools = npt.NDArray[np.bool_]
+
+Field = Callable[[Array], Array]
+"""(N, 3) points to (N,) values, positive inside; about the distance to the edge."""
+
+SNAP = 0.1  # share of an edge within which a cut goes through the edge's end: thinner slivers are not worth a triangle
+
+
+def carved(patches: Iterable[Patch], inside: Field, tag: str | None) -> list[Patch]:
+    """Return patches with what lies inside as patches of their own.
+
+    Args:
+        patches: smooth surfaces, before they are placed.
+        inside: where to carve.
+        tag: what is carved out becomes this; None leaves it out.
+    """
+    found = []
+    for patch in patches:
+        value = _snapped(patch, inside(patch.vertices))
+        if value.max() <= 0.0:
+            found.append(patch)
+            continue
+        cut, side = _split(patch, value)
+        found += [cropped(replace(cut, faces=cut.faces[~side]))] if not side.all() else []
+        found += [cropped(replace(cut, faces=cut.faces[side], tag=tag))] if tag is not None and side.any() else []
+    return found
+
+
+def cropped(patch: Patch) -> Patch:
+    """Return the patch with a chart that is as large as what its faces use of it."""
+    used = patch.uvs[np.unique(patch.faces)]
+    low, span = used.min(axis=0), np.ptp(used, axis=0)
+    size = (patch.size[0] * float(span[0]), patch.size[1] * float(span[1]))
+    uvs = np.clip((patch.uvs - low) / span, 0.0, 1.0)
+    return replace(patch, uvs=uvs, size=size, rest=lambda u, v: patch.rest(low[0] + u * span[0], low[1] + v * span[1]))
+
+
+def _edges(patch: Patch) -> Indices:
+    """The (E, 2) edges of a patch."""
+    pairs = np.concatenate([patch.faces[:, [0, 1]], patch.faces[:, [1, 2]], patch.faces[:, [2, 0]]])
+    edges: Indices = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
+    return edges
+
+
+def _snapped(patch: Patch, value: Array) -> Array:
+    """The values with 0 at vertices that the curve passes closely."""
+    edges = _edges(patch)
+    ends = value[edges]
+    crossed = ends[:, 0] * ends[:, 1] < 0.0
+    share = np.abs(ends[crossed]) / np.abs(ends[crossed]).sum(axis=1, keepdims=True)
+    value = value.copy()
+    value[edges[crossed][share < SNAP]] = 0.0
+    return value
+
+
+def _split(patch: Patch, value: Array) -> tuple[Patch, Bools]:
+    """The patch with its triangles split where the values change sign, and (F,) whether each face is inside."""
+    edges = _edges(patch)
+    crossed = edges[value[edges[:, 0]] * value[edges[:, 1]] < 0.0]
+    a, b = crossed.T
+    share = (value[a] / (value[a] - value[b]))[:, None]
+    extra = [one[a] + share * (one[b] - one[a]) for one in (patch.vertices, patch.normals, patch.uvs)]
+    extra[1] /= np.linalg.norm(extra[1], axis=1, keepdims=True)
+    number = {(int(i), int(j)): len(patch.vertices) + k for k, (i, j) in enumerate(crossed)}
+    faces: list[tuple[int, int, int]] = []
+    side: list[bool] = []
+    for face in patch.faces:
+        here = value[face]
+        if here.min() >= 0.0 or here.max() <= 0.0:
+            faces.append(tuple(int(i) for i in face))  # type: ignore[arg-type]
+            side.append(bool(here.sum() > 0.0))
+            continue
+        around: list[tuple[int, float]] = []  # the outline with the cuts in it
+        for i in range(3):
+            one, other = int(face[i]), int(face[(i + 1) % 3])
+            around.append((one, float(value[one])))
+            cut = number.get((min(one, other), max(one, other)))
+            if cut is not None:
+                around.append((cut, 0.0))
+        for sign in (1.0, -1.0):
+            part = [index for index, at in around if at * sign >= 0.0]
+            for k in range(1, len(part) - 1):
+                faces.append((part[0], part[k], part[k + 1]))
+                side.append(sign > 0.0)
+    before = (patch.vertices, patch.normals, patch.uvs)
+    places, normals, uvs = (np.concatenate([one, more]) for one, more in zip(before, extra, strict=True))
+    return replace(patch, vertices=places, normals=normals, uvs=uvs, faces=np.array(faces)), np.array(side)

@@ -14,9 +14,8 @@ from typing import Concatenate, ParamSpec
 
 import numpy as np
 
-from .curves import Array
-from .draw import Color, Draw, hexed
-from .shapes import Indices
+from advsearch.bundled.objects.draw import Color, Draw, hexed
+from advsearch.bundled.objects.shapes import Array, Indices
 
 Options = ParamSpec("Options")
 

@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from .curves import Array, dense, ellipse, polygon, rectangle, rotation, rounded
-from .draw import Draw
-from .family import Instance, family, finish
-from .shapes import Patch, lathe, placed, sphere, sweep
-from .textures import (
+from advsearch.bundled.objects.draw import Draw
+from advsearch.bundled.objects.family import Instance, family, finish
+from advsearch.bundled.objects.shapes import (
+    Array,
+    Patch,
+    dense,
+    ellipse,
+    lathe,
+    placed,
+    polygon,
+    rectangle,
+    rotation,
+    rounded,
+    sphere,
+    sweep,
+)
+from advsearch.bundled.objects.textures import (
     Texels,
     between,
     clouded,

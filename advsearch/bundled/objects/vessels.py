@@ -4,11 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from .curves import Array, at_height, dense, ellipse, rectangle, rotation, rounded, spline, upright
-from .draw import Draw, hexed
-from .family import Instance, family, finish
-from .shapes import Patch, lathe, placed, sweep, vessel
-from .textures import (
+from advsearch.bundled.objects.draw import Draw, hexed
+from advsearch.bundled.objects.family import Instance, family, finish
+from advsearch.bundled.objects.shapes import (
+    Array,
+    Patch,
+    at_height,
+    dense,
+    ellipse,
+    lathe,
+    placed,
+    rectangle,
+    rotation,
+    rounded,
+    spline,
+    sweep,
+    upright,
+    vessel,
+)
+from advsearch.bundled.objects.textures import (
     Paint,
     Texels,
     anything,

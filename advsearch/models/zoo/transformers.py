@@ -19,7 +19,7 @@ from advsearch.errors import ModelError, resembling
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source, source_of
-from advsearch.models.zoo import language, named, outputs, zero_shot
+from advsearch.models.zoo import language, outputs, zero_shot
 from advsearch.models.zoo.library import Adapted, Ask, Loaded, cached_file, in_pixels, library, processor_of, reading
 
 
@@ -73,7 +73,7 @@ def load(spec: str) -> Source:
             where["local_files_only"] = True
         saved = _config(transformers, name, spec, where)
         if saved.get("model_type") == "timm_wrapper" and "architectures" not in saved:  # which timm itself has saved
-            return named.timm_repository(spec, name, revision)
+            return outputs.timm_repository(spec, name, revision)
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
         kind = _kind(architecture, getattr(transformers, architecture, None), spec)
@@ -234,7 +234,7 @@ def _of_clips(loaded: Loaded) -> Source:
 
 NETWORKS = (
     _called("ForVideoClassification", _of_clips),
-    _called("TimmWrapperForImageClassification", named.wrapped_timm, "AutoModelForImageClassification"),
+    _called("TimmWrapperForImageClassification", outputs.wrapped_timm, "AutoModelForImageClassification"),
     _called("ForImageClassification", partial(outputs.source, plain=_with_names(_logits))),
     _called("ForSemanticSegmentation", _with_names(_logits_by_pixel)),
     Family(outputs.is_ours, "AutoModelForUniversalSegmentation", outputs.mask_source),

@@ -15,7 +15,7 @@ from advsearch.questions.attack.summary import AttackSummary, CurveResult, Matri
     "attack --object mug --control texture",
     "attack --object mug --control texture --epsilon 0.03 --set camera.azimuth=130 --seed 1",
     "attack --object mug --model reference,torchvision:resnet18 --label mug,cup",
-    called="advsearch.questions.attack.session:attack",
+    called="advsearch.questions.attack.carry_out:attack",
 )
 def attack(asked: Asked[AttackConfig]) -> AttackSummary | CurveResult | MatrixResult:
     """Find the worst configuration of a scene, and verify it with fresh renders; or do so for several."""

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult, count_right
 from advsearch.attacks.candidates import Bracket, FoundFailure
-from advsearch.attacks.rate_samples import MOST_TIMES, MOVED, OVER_LADDER
+from advsearch.attacks.trials import MOST_TIMES, MOVED, OVER_LADDER
 from advsearch.described import OUT_OF_VIEW, Value
 from advsearch.engine.journal import Journal
-from advsearch.engine.objective import domain_of, print_terms
+from advsearch.engine.judging import domain_of, print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages, control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.transport import remark

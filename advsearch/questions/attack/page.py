@@ -36,7 +36,7 @@ from advsearch.report.wording import (
     prediction_text,
     seconds_text,
 )
-from advsearch.runs import directory, images, store
+from advsearch.runs import directory, files, store
 from advsearch.runs.results import Result
 from advsearch.viewer.document import data_script, data_url
 from advsearch.viewer.pages import object_data, object_part, read_object, shown_page
@@ -108,7 +108,7 @@ def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[
     elif where:
         others = "in other trials they, and what the model says, are others."
         note = f"Both of trial {trial}, with the same {where}; {others}"
-    gain = f"{images.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
+    gain = f"{files.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
     seen = [*pair(".png"), Picture("images/difference.png", gain, "Difference")]
     yield ResultPart("What the model sees", pictures=[seen], note=note)
     yield ResultPart(live="compare")
@@ -125,8 +125,8 @@ def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[
     if animated:
         yield ResultPart("The search, step by step", live="search")
     if summary.drive is not None:
-        files, frames = {"drive-clean": "Clean", "drive": "Adversarial"}, "from the first frame to the last"
-        strips = [Picture(f"images/{file}.png", frames, name) for file, name in files.items()]
+        pictures, frames = {"drive-clean": "Clean", "drive": "Adversarial"}, "from the first frame to the last"
+        strips = [Picture(f"images/{file}.png", frames, name) for file, name in pictures.items()]
         note = f"The model is {wording.drive_text(summary)}."
         yield ResultPart("Along the drive", pictures=[strips], layout="rows", note=note)
 
@@ -236,6 +236,6 @@ def _read_frames(file: Path) -> list[str]:
                 stream = io.BytesIO()
                 frame.convert("RGB").save(stream, "JPEG", quality=FRAME_QUALITY)
                 frames.append(data_url(stream.getvalue(), "image/jpeg"))
-    except images.BAD_PICTURE:
+    except files.BAD_PICTURE:
         return []
     return frames if len(frames) > 1 else []

@@ -17,22 +17,20 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult
+from advsearch.controls.base import OneOf
 from advsearch.controls.path import WAY, PathControl
-from advsearch.controls.values import OneOf
+from advsearch.engine.judging import task_for
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import AnyModel, in_turn
-from advsearch.engine.objective import task_for
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings
 from advsearch.engine.rendering import Rendering, pictures_of, render
 from advsearch.errors import InputError
 from advsearch.questions.attack.summary import AlongDrive, AttackSummary
 from advsearch.registry import names_code
-from advsearch.report.figures import new_axes, search_axes
-from advsearch.report.marks import marked
-from advsearch.report.markup import result_html, side_by_side
-from advsearch.report.shown import shown
-from advsearch.runs import images, store
+from advsearch.report.figures import marked, new_axes, search_axes
+from advsearch.report.shown import result_html, shown, side_by_side
+from advsearch.runs import files, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.scene.assets import Shape, simpler
@@ -278,8 +276,8 @@ def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, show
         save_marked(run, name, kept.picture, problem.marks(kept.picture, kept.whole))
         if problem.aovs:
             surfaces, file = problem.renderer.surfaces(kept.whole), run.path / IMAGES / f"{name}.aov.exr"
-            images.write_layers(file, surfaces.layers(problem.aovs, OBJECT), surfaces.notes(problem.aovs))
-    run.save_image("difference", images.difference(shown["clean"].picture, shown["adversarial"].picture))
+            files.write_layers(file, surfaces.layers(problem.aovs, OBJECT), surfaces.notes(problem.aovs))
+    run.save_image("difference", files.difference(shown["clean"].picture, shown["adversarial"].picture))
     checked = findings.verification
     kind = "verification" if findings.beaten is None else "baseline verification"
     if checked is not None:

@@ -33,7 +33,7 @@ from advsearch.engine import planning, surface_light
 from advsearch.engine.bank import Bank
 from advsearch.engine.gradients import inside
 from advsearch.engine.journal import PLAN, Journal, finite, other_numbers, same
-from advsearch.engine.objective import penalised
+from advsearch.engine.judging import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.surface_light import SurfaceLight

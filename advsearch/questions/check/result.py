@@ -8,8 +8,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from advsearch.config import DerivativeConfig, SceneConfig, TimedConfig
-from advsearch.report.markup import InNotebook
-from advsearch.report.shown import Column, ResultPart, ShownResult
+from advsearch.report.shown import Column, InNotebook, ResultPart, ShownResult
 from advsearch.runs.results import (
     OUT_OF_TIME,
     Fields,

@@ -10,8 +10,7 @@ from pydantic import Field
 
 from advsearch.questions.sweep.summary import AxisValue, CountedPredictions
 from advsearch.report import wording
-from advsearch.report.markup import InNotebook
-from advsearch.report.shown import Claim, Column, Picture, ResultPart, ShownResult, claim, counted
+from advsearch.report.shown import Claim, Column, InNotebook, Picture, ResultPart, ShownResult, claim, counted
 from advsearch.report.wording import conditions_text, percent, share_of_text
 from advsearch.runs.results import ConditionRow, Fields, Interval, JsonFloat, RunResult
 

@@ -24,13 +24,12 @@ from advsearch.progress import Watched, watcher
 from advsearch.question import Asked
 from advsearch.questions.attack.carry_out import LOADING, executor_for
 from advsearch.questions.harden import scenes
-from advsearch.questions.harden.detectors import DetectorCourse, Loss, read_coco
+from advsearch.questions.harden.detectors import DetectorCourse, Loss, SegmenterCourse, read_coco
 from advsearch.questions.harden.result import HardenConfig, HardenedControl, HardenResult, Share, SplitSide
 from advsearch.questions.harden.rounds import PICTURES, WEIGHTS, Course, MakeOptimiser, Rounds
 from advsearch.questions.harden.scenes import FURTHER, HELD_OUT, ROBUST, TRAINING, VALIDATION, SceneWork
-from advsearch.questions.harden.segmenters import SegmenterCourse
 from advsearch.questions.harden.training import ClassifierCourse, Examples
-from advsearch.rooms import made_question
+from advsearch.registry import made_question
 from advsearch.runs.directory import ARTIFACTS, RunDirectory, is_run, run_path
 from advsearch.runs.results import SharedWork
 from advsearch.runs.store import Row

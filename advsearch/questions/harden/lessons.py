@@ -27,8 +27,7 @@ from advsearch.attacks import Domain
 from advsearch.controls import Space
 from advsearch.engine.problem import Problem
 from advsearch.models import Model
-from advsearch.runs.files import replacing
-from advsearch.runs.images import write_png
+from advsearch.runs.files import replacing, write_png
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.transport.lights import why_not
 from advsearch.scene.transport.matrix import LinearRenderer

@@ -10,8 +10,17 @@ from pydantic import Field, JsonValue, model_validator
 from advsearch.questions.attack.settings import STEPS, AttackConfig
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, RED, draw_shares
-from advsearch.report.markup import InNotebook
-from advsearch.report.shown import NO_PROOF, Claim, Column, Extent, ResultPart, ShownResult, claim, share_text
+from advsearch.report.shown import (
+    NO_PROOF,
+    Claim,
+    Column,
+    Extent,
+    InNotebook,
+    ResultPart,
+    ShownResult,
+    claim,
+    share_text,
+)
 from advsearch.report.wording import interval_text, percent
 from advsearch.runs.results import Fields, Interval, RunResult, SharedWork
 from advsearch.settings import setting, setting_as_in

@@ -25,7 +25,7 @@ from pydantic import Field
 
 from advsearch.errors import InputError
 from advsearch.report import wording
-from advsearch.report.markup import Html, element, join_html
+from advsearch.report.shown import Html, element, join_html
 from advsearch.report.wording import percent
 from advsearch.runs.directory import IMAGES
 from advsearch.runs.results import Fields, Interval

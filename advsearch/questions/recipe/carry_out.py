@@ -23,9 +23,9 @@ from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.attack.summary import AttackSummary, FoundValue, SearchDistribution, attack_of
 from advsearch.questions.photographs.carry_out import Photographs, photographs_in
 from advsearch.questions.photographs.result import LOOSE_PHOTO, PHOTO
-from advsearch.questions.recipe import description, frame, given, rates
+from advsearch.questions.recipe import description, given, rates
 from advsearch.questions.recipe.description import PHOTOGRAPHS, PlannedRun, Recipe, first_of, planned
-from advsearch.questions.recipe.frame import TRIAL, TRIALS, WORKERS, MadeFigure, Options, Rows, frame_of, read_rows
+from advsearch.questions.recipe.rates import TRIAL, TRIALS, WORKERS, MadeFigure, Options, Rows, frame_of, read_rows
 from advsearch.questions.recipe.result import RecipeConfig, RecipeFigure, RecipePart, RecipeResult
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.settings import SweepConfig
@@ -60,7 +60,7 @@ TOGETHER = ("agreement", "scaling", "surface")
 """Kinds that tell several models apart by themselves; of the others each model has one."""
 
 NAMING = ("by", "series", "texture", "shape", "shares")  # options of figures that name columns
-OUTER = ("object", "environment", frame.MODEL, frame.PREDICTION, frame.PART)  # columns of every recipe
+OUTER = ("object", "environment", rates.MODEL, rates.PREDICTION, rates.PART)  # columns of every recipe
 ANY = "*"  # stands for the parameters of a control that does not say beforehand which it has
 
 
@@ -160,7 +160,7 @@ def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
 
 def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where: str) -> None:
     """Refuse, by an InputError, a figure of a part or a column that there is not; `columns` are those of each part."""
-    known = {*OUTER, *([frame.GROUP] if recipe.groups else [])}
+    known = {*OUTER, *([rates.GROUP] if recipe.groups else [])}
     for number, described in enumerate(recipe.figures, start=1):
         kind, options = read_options(described, where)
         place, beside = f"It stands in {where}, figure {number} ({kind})", getattr(options, "beside", None)
@@ -277,10 +277,10 @@ def read_options(described: Mapping[str, object], where: str) -> tuple[str, Opti
 
 def make(rows: Rows, kind: str, options: Options) -> Iterator[MadeFigure]:
     """Yield a figure, or one for each model; an InputError where it needs what the predictions do not have."""
-    parts, made = rows[frame.PART], FIGURES[kind][1]
+    parts, made = rows[rates.PART], FIGURES[kind][1]
     shown = rows[parts.isin(options.parts) if options.parts else parts != PHOTOGRAPHS]
-    together = kind in TOGETHER or frame.MODEL in vars(options).values() or frame.MODEL not in shown
-    models = {"": shown} if together else frame.by(shown, frame.MODEL)
+    together = kind in TOGETHER or rates.MODEL in vars(options).values() or rates.MODEL not in shown
+    models = {"": shown} if together else rates.by(shown, rates.MODEL)
     for name, some in models.items():
         figure = made(some, options)
         title = options.title or figure.title

@@ -14,8 +14,8 @@ import pandas as pd
 from pydantic import Field
 
 from advsearch.attacks.trials import CONFIDENCE
-from advsearch.questions.recipe import frame
-from advsearch.questions.recipe.frame import MadeFigure, Options, Rows, Tally
+from advsearch.questions.recipe import rates
+from advsearch.questions.recipe.rates import MadeFigure, Options, Rows, Tally
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.wording import percent
 
@@ -31,13 +31,13 @@ class PredictionsOptions(Options):
 
 def predictions(rows: Rows, options: PredictionsOptions) -> MadeFigure:
     groups: dict[str, list[tuple[Tally, int]]] = {}  # how often each was given, and how often it was a right one
-    for value, some in frame.by(rows, options.by).items():
+    for value, some in rates.by(rows, options.by).items():
         groups[value] = []
-        for label, _ in frame.most_frequent(some[frame.PREDICTION])[: options.most]:
-            flags = some[frame.PREDICTION] == label
+        for label, _ in rates.most_frequent(some[rates.PREDICTION])[: options.most]:
+            flags = some[rates.PREDICTION] == label
             groups[value].append((Tally.over(label, some, flags), int(some["correct"][flags].sum())))
     wrong = {value: each[0] for value, each in groups.items() if 2 * each[0][1] < each[0][0].times}
-    known, thing = len(groups) - len(wrong), frame.plural(options.by)
+    known, thing = len(groups) - len(wrong), rates.plural(options.by)
     text = [f"For {known} of {len(groups)} {thing} the most frequent prediction is mostly a right one."]
     text += [
         f"For {value} it is {tally.name}, {tally.told('given')} and right in {right} of these."
@@ -59,7 +59,7 @@ def predictions(rows: Rows, options: PredictionsOptions) -> MadeFigure:
         axes.set(xlabel="share of predictions; blue: mostly right, red: mostly wrong, grey: others", xlim=(0.0, 1.0))
 
     table = [[value, tally.name, *tally.cells, right] for value, given in groups.items() for tally, right in given]
-    heads = [options.by, "prediction", "given in", *frame.COUNT, "right"]
+    heads = [options.by, "prediction", "given in", *rates.COUNT, "right"]
     title = f"Most frequent predictions by {options.by}"
     return MadeFigure(title, text, heads, table, draw, (6.4, 1.2 + 0.3 * len(groups)))
 
@@ -88,11 +88,11 @@ class CuesOptions(Options):
 def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
     """Count how often the prediction is the object and how often the texture, and which of both foretells it better."""
 
-    textures, naming = frame.by(rows, options.texture), dict[str, Any]()
+    textures, naming = rates.by(rows, options.texture), dict[str, Any]()
     for texture, some in textures.items():
         classes = set(options.classes.get(texture, ()))
         # the whole prediction, or one of the names that it consists of
-        parts = some[frame.PREDICTION].map(lambda label: {label.strip(), *map(str.strip, label.split(","))})
+        parts = some[rates.PREDICTION].map(lambda label: {label.strip(), *map(str.strip, label.split(","))})
         naming[texture] = ~parts.map(classes.isdisjoint)
     shapes = {name: Tally.over(name, some) for name, some in textures.items()}
     named = {name: Tally.over(name, some, naming[name]) for name, some in textures.items()}
@@ -103,7 +103,7 @@ def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
         text.append(f"The prediction names the texture ({', '.join(asked)}): {total.told('so')}.")
         text += [] if total.share else ["A model that has no class for a texture cannot name it."]
     text.append(_which(predicted(rows, options)))
-    text += frame.extremes(list(shapes.values()), "The hardest texture", "the easiest", "textures")
+    text += rates.extremes(list(shapes.values()), "The hardest texture", "the easiest", "textures")
 
     def draw(figure: Any) -> None:
         axes, ordered = figure.subplots(), sorted(shapes, key=lambda name: shapes[name].share or 0.0)
@@ -117,7 +117,7 @@ def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
         figure.legend(loc="outside lower center", ncols=2, title="the prediction names")
 
     table = [[name, *shapes[name].cells, named[name].times] for name in textures]
-    heads, title = [options.texture, "the object", *frame.COUNT, "the texture"], "Predictions by shape and by texture"
+    heads, title = [options.texture, "the object", *rates.COUNT, "the texture"], "Predictions by shape and by texture"
     return MadeFigure(title, text, heads, table, draw, (6.0, 1.7 + 0.27 * len(textures)))
 
 
@@ -128,13 +128,13 @@ def predicted(rows: Rows, options: CuesOptions) -> list[tuple[int, int, int]]:
     about the same texture on other objects, drawn so that both are as many as the fewer are. None of the predicted
     predictions is among them, so that a model which goes by neither cue is predicted as well by both."""
     generator, counts = random.Random(SEED), []
-    groups = rows.groupby([frame.column(rows, options.shape), frame.column(rows, options.texture)], sort=False)
-    pairs = {pair: list(some[frame.PREDICTION]) for pair, some in groups}
+    groups = rows.groupby([rates.column(rows, options.shape), rates.column(rows, options.texture)], sort=False)
+    pairs = {pair: list(some[rates.PREDICTION]) for pair, some in groups}
     for (shape, texture), given in pairs.items():
         same_shape = [label for (s, t), more in pairs.items() if s == shape and t != texture for label in more]
         same_texture = [label for (s, t), more in pairs.items() if t == texture and s != shape for label in more]
         if drawn := min(len(same_shape), len(same_texture)):
-            cues = (frame.most_frequent(generator.sample(cue, drawn))[0][0] for cue in (same_shape, same_texture))
+            cues = (rates.most_frequent(generator.sample(cue, drawn))[0][0] for cue in (same_shape, same_texture))
             by_shape, by_texture = map(given.count, cues)
             counts.append((len(given), by_shape, by_texture))
     return counts
@@ -189,24 +189,24 @@ class TernaryOptions(Options):
 
 def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
     """Count where in a mixture each prediction is given; where all are the same, how far the right one leads."""
-    amounts = np.stack([frame.numbers(rows, name) for name in options.shares], axis=1)
-    sums, names = amounts.sum(axis=1, keepdims=True), [frame.bare(name) for name in options.shares]
+    amounts = np.stack([rates.numbers(rows, name) for name in options.shares], axis=1)
+    sums, names = amounts.sum(axis=1, keepdims=True), [rates.bare(name) for name in options.shares]
     mixtures = amounts / np.where(sums == 0.0, 1.0, sums)
     most = mixtures.argmax(axis=1)  # of what most of each mixture is
     corners = all_triangles(options.side)
     places = pd.Series([triangle_of(mixture, options.side) for mixture in mixtures])
     inside = [(places == triangle).to_numpy() for triangle in corners]
-    given, lead = frame.most_frequent(rows[frame.PREDICTION]), rows["margin"].astype(float).to_numpy()
+    given, lead = rates.most_frequent(rows[rates.PREDICTION]), rows["margin"].astype(float).to_numpy()
     leads = {name: lead[(most == number) & ~np.isnan(lead)] for number, name in enumerate(names)}
     by_lead = len(given) == 1 and min(map(len, leads.values())) >= 2
-    text, table, panels = list[str](), list[list[frame.Cell]](), dict[str, list[float | None]]()
-    heads = ["prediction", "where most is", "given in", *frame.COUNT]
+    text, table, panels = list[str](), list[list[rates.Cell]](), dict[str, list[float | None]]()
+    heads = ["prediction", "where most is", "given in", *rates.COUNT]
     if by_lead:
         text = [MEANINGLESS.format(given[0][0]), _told_leads(leads)]
         heads = ["where most is", "pictures", "mean lead of the right label", "standard error"]
         table = [[name, len(values), float(values.mean()), _error(values)] for name, values in leads.items()]
     for label, times in given[: options.most]:
-        flags = (rows[frame.PREDICTION] == label).to_numpy()
+        flags = (rows[rates.PREDICTION] == label).to_numpy()
         values = lead if by_lead else flags
         known = [values[here & ~np.isnan(values)] for here in inside]
         panels[label] = [float(some.mean()) if len(some) else None for some in known]
@@ -218,7 +218,7 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
             text.append(f"{whose} given as often whatever most of the mixture is: no difference is shown.")
         else:
             least, most_often = f"{whose} rarest where most of the mixture", "most frequent where most of it"
-            text += frame.extremes(by_most, least, most_often, "ingredients", "given")
+            text += rates.extremes(by_most, least, most_often, "ingredients", "given")
         table += [[label, tally.name, *tally.cells] for tally in by_most]
     if empty := sum(not here.any() for here in inside):
         text.append(f"No picture was drawn in {empty} of {len(corners)} parts of the diagram, which are hatched.")

@@ -4,22 +4,227 @@ parts of a surface that go with wrong predictions."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
+import pandas as pd
 from pandas.api.types import is_numeric_dtype
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field
 
+from advsearch.attacks.trials import CONFIDENCE
+from advsearch.attacks.units import per_unit, share_interval
+from advsearch.described import OUT_OF_VIEW
 from advsearch.errors import InputError
-from advsearch.questions.recipe import frame
+from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.recipe.description import PHOTOGRAPHS
-from advsearch.questions.recipe.frame import MadeFigure, Options, Rows, Tally
 from advsearch.questions.sweep.display import surface_sentences
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.figures import BLUE, MARKS, SERIES, draw_shares
-from advsearch.report.wording import count, figure_value, percent, short_name
+from advsearch.report.wording import count, figure_value, interval_text, percent, short_name
 from advsearch.runs.directory import IMAGES, PARTS
+from advsearch.runs.results import Interval
+from advsearch.runs.store import NAME, Store
+from advsearch.runs.tables import units_of
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The rows of a recipe's runs as one frame, and what all figures make of it: counts, sentences, a picture.
+
+PREDICTION, GROUP, PART, TRIAL, MODEL, WORKERS = "answer", "group", "part", "trial", "model", "workers"
+"""Columns beside parameters: what the model said, the group that an object is in, the part of the recipe, which trial
+of an attack it is, the model, and the number of processes that shared a sweep, of sweeps that say it."""
+
+OTHERS = "other objects"
+
+TRIALS = {"first control": "clean scene", "control": "clean scene", "verification": "answer",
+          "baseline verification": "random search"}  # fmt: skip
+"""The rows of an attack that are in the frame, and what figures call them."""
+
+COUNT = ["of", "share", "low", "high"]  # columns of a count behind the one of what is counted
+Cell = str | int | float | None
+Numbers = npt.NDArray[np.float64]
+Rows = Any  # pd.DataFrame, which has no types
+
+
+def read_rows(
+    part: str, folder: Path, summary: AttackSummary | SweepSummary, seed: int, kinds: Sequence[str], **more: Cell
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Return the rows of some kinds that a run has stored, and the units of their parameters. Each has what it shows
+    (`object`, `environment`, `model`, and parameters), what was said of it (`answer`, `correct`, `margin`), the `time`
+    when it was stored, seconds since 1970, and the `unit` of what it shares with rows that are not independent of it:
+    draws of one seed are the same ones, also in another part."""
+    rows, units, drawn, alike = list[dict[str, Any]](), dict[str, str](), None, 1
+    with Store(folder / NAME, read_only=True) as store:
+        if isinstance(summary, SweepSummary):
+            # without draws, samples of a point differ by noise alone
+            drawn, alike = units_of(store), 1 if summary.sampler is not None else summary.samples
+        for row in store.rows():
+            if row.kind not in kinds or (row.kind == "sweep" and row.label == OUT_OF_VIEW):
+                continue
+            values: dict[str, Any] = {name: about["value"] for name, about in row.values.items()}
+            units |= {name: about["unit"] for name, about in row.values.items()}
+            unit = f"{folder.name} {row.kind} {row.id}"
+            if row.kind == "sweep" and drawn is not None:
+                unit = f"{seed} {drawn.of(row.step) // alike}"
+            if isinstance(summary, AttackSummary):
+                values[TRIAL], unit = TRIALS[row.kind], f"{seed} {row.step}"
+            for name in ("object", "environment", MODEL):
+                values[name] = figure_value(str(values.get(name, getattr(summary, name))))
+            values |= {PREDICTION: row.label or "none", "correct": bool(row.correct), "margin": row.margin}
+            rows.append({**values, "time": row.time, PART: part, "unit": unit, **more})
+    return rows, units
+
+
+def frame_of(rows: Iterable[Mapping[str, Any]], groups: Mapping[str, Sequence[str]], **facts: Any) -> Rows:
+    """Return rows as a frame, with the groups that name their objects if there are any; its ``attrs`` are the facts."""
+    frame = pd.DataFrame(rows)
+    if groups:
+        named = {name: group for group, objects in reversed(list(groups.items())) for name in objects}
+        frame[GROUP] = [named.get(name, OTHERS) for name in frame["object"]]
+    frame.attrs = facts
+    return frame
+
+
+def column(rows: Rows, name: str) -> Any:
+    """Return what each row has in a column; an InputError where some have nothing."""
+    if name not in rows or rows[name].isna().any():
+        named = rows.columns.drop(["correct", "margin", "time", "unit"])
+        known = ", ".join(other for other in named if rows[other].notna().all())
+        raise InputError(f"figures: expected one of {known}, got {name[:60]!r}")
+    return rows[name]
+
+
+def numbers(rows: Rows, name: str) -> Any:
+    """Return what each row has in a column of numbers; an InputError where it has names."""
+    if not pd.api.types.is_numeric_dtype(column(rows, name)):
+        raise InputError(f"figures: {name}: expected a parameter with numbers, got names")
+    return rows[name]
+
+
+def unit_of(rows: Rows, name: str) -> str:
+    """Return the unit of a column as it stands behind a number: a space and the unit, or nothing."""
+    return "" if (unit := rows.attrs["units"].get(name, "")) in ("", "1", "name") else f" {unit}"
+
+
+def by(rows: Rows, name: str) -> dict[str, Rows]:
+    """Return the rows by what they have in a column, in the order in which that first comes; numbers by size."""
+    size = pd.api.types.is_numeric_dtype(column(rows, name))
+    return {figure_value(value): some for value, some in rows.groupby(name, sort=size)}
+
+
+def most_frequent(predictions: Iterable[str]) -> list[tuple[str, int]]:
+    """Return predictions with how often each was given, the most frequent first."""
+    return sorted(Counter(predictions).items(), key=lambda item: (-item[1], item[0]))
+
+
+class Tally:
+    """How many of some rows are counted: of each independent unit, such as a drive, `counted` (n,) of its `of` (n,);
+    in all `times` of `total`, and their share, None where there are no rows."""
+
+    def __init__(self, name: str, counted: Numbers, of: Numbers) -> None:
+        self.name, self.counted, self.of = name, counted, of
+        self.times, self.total = round(float(counted.sum())), round(float(of.sum()))
+        self.share = float(counted.sum() / of.sum()) if self.total else None
+
+    @classmethod
+    def over(cls, name: str, rows: Rows, flags: Any = None) -> Tally:
+        """Count rows: those with right predictions, or those that flags (n,) say."""
+        counted = np.asarray(rows["correct"] if flags is None else flags, dtype=np.float64)
+        units = pd.factorize(rows["unit"])[0]
+        return cls(name, per_unit(counted, units), per_unit(np.ones(len(rows)), units))
+
+    def called(self, name: str) -> Tally:
+        return Tally(name, self.counted, self.of)
+
+    @property
+    def cells(self) -> list[Cell]:
+        return [self.times, self.total, self.share, *(self.interval() or (None, None))]
+
+    @property
+    def drawn(self) -> tuple[float, Interval] | None:
+        return None if self.share is None else (self.share, self.interval() or (0.0, 1.0))
+
+    def interval(self, among: int = 1) -> Interval | None:
+        """Return the 95 % interval of the share, widened for a choice among so many (Bonferroni)."""
+        return share_interval(self.counted, self.of, 1.0 - (1.0 - CONFIDENCE) / max(among, 1)) if self.total else None
+
+    def told(self, verb: str = "right") -> str:
+        """Return ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``; `verb` is what is counted."""
+        share = f"{percent(self.share)}, 95 % interval {interval_text(self.interval())}"
+        return f"{verb} in {self.times} of {self.total} ({share})"
+
+    def below(self, other: Tally, among: int = 1) -> bool:
+        """Return whether the interval of this share lies below that of another, both widened."""
+        lower, upper = self.interval(among), other.interval(among)
+        return lower is not None and upper is not None and lower[1] < upper[0]
+
+
+def extremes(counts: Sequence[Tally], worst: str, best: str, thing: str, verb: str = "right") -> list[str]:
+    """Return which of several has the lowest share and which the highest, and whether that is more than chance: the two
+    were chosen among k for being extreme, so that they are compared by intervals of confidence 1 - 0.05 / k, which hold
+    for all k together. Where these overlap, no difference is shown. `verb` is what is counted."""
+    known = [count for count in counts if count.total]
+    if len(known) < 2:
+        return [f"{count.name}: {count.told(verb)}." for count in known]
+    shares = [count.share or 0.0 for count in known]
+    low, high = known[int(np.argmin(shares))], known[int(np.argmax(shares))]
+    if low.share == high.share:
+        return [f"All {len(known)} {thing} have the same share, {percent(low.share)}: no difference is shown."]
+    named = []
+    for tally in (low, high):
+        ties = shares.count(tally.share or 0.0) - 1
+        also = f" (as {ties} other{'s' if ties > 1 else ''})" if ties else ""
+        named.append(f"is {tally.name}{also}: {tally.told(verb)}")
+    widened = f"the intervals of the two, widened for having been chosen among {len(known)},"
+    return [
+        f"{worst} {named[0]}; {best} {named[1]}.",
+        f"The difference is shown: {widened} do not overlap."
+        if low.below(high, len(known))
+        else f"No difference between the {thing} is shown: {widened} overlap.",
+    ]
+
+
+def plural(name: str) -> str:
+    """Return what several values of a column are called: ``environments``, ``materials``, ``values of pose.yaw``."""
+    control, _, parameter = name.partition(".")
+    return "kinds of trials" if name == TRIAL else f"{control}s" if parameter in ("", "which") else f"values of {name}"
+
+
+def bare(name: str) -> str:
+    """Return a parameter's name without its control: ``milk`` for ``contents.milk``."""
+    return name.rpartition(".")[2]
+
+
+class Options(BaseModel):
+    """Options that every figure has: a title in place of its own, and the parts whose rows it shows; all where none is
+    named."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    title: str = Field(default="", max_length=200)
+    of: tuple[str, ...] = ()
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        return self.of
+
+
+@dataclass(frozen=True)
+class MadeFigure:
+    """A figure: title, sentences, a table of its numbers, what draws all but the title, and its size in inches."""
+
+    title: str
+    text: Sequence[str]
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    draw: Callable[[Any], None]
+    size: tuple[float, float]
+
 
 BINS, FITTING = 12, 4  # parts of a range where lines are drawn along it, and letters that stand level under a column
 Cells = Mapping[str, Sequence[Tally]]  # counts by the name of a row, one of each series
@@ -50,27 +255,27 @@ class RatesOptions(Options):
 
 def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
     verb, form, second = "wrong" if options.wrong else "right", options.form, options.series
-    beside, rows = rows[rows[frame.PART] == options.beside], rows[rows[frame.PART] != options.beside]
+    beside, rows = rows[rows[PART] == options.beside], rows[rows[PART] != options.beside]
     if rows.empty:
         raise InputError(f"figures: rates: expected rows of a part beside {options.beside!r}, got none")
-    lines = list(frame.by(rows, second)) if second else [""]
+    lines = list(by(rows, second)) if second else [""]
     groups, middles = _groups(rows, options)
 
     def called(name: str) -> str:
         return options.names.get(name, name)
 
     def counts(name: str, some: Rows) -> list[Tally]:
-        split = frame.by(some, second) if second and len(some) else {"": some}
+        split = by(some, second) if second and len(some) else {"": some}
         each = [split.get(line, some[:0]) for line in lines]
         return [Tally.over(name, part, part["correct"] != options.wrong) for part in each]
 
     cells = {called(name): counts(name, some) for name, some in groups.items()}
-    if form == "bars" and middles is None and not is_numeric_dtype(frame.column(rows, options.by)):
+    if form == "bars" and middles is None and not is_numeric_dtype(column(rows, options.by)):
         cells = dict(sorted(cells.items(), key=lambda item: -(item[1][0].share or 0.0)))
     series, totals = [called(name) for name in lines], counts("all", rows)
-    of_what = f"{frame.bare(second or '')} "  # a number says what it is of: "severity 3"
+    of_what = f"{bare(second or '')} "  # a number says what it is of: "severity 3"
     of_series = [of_what * (name[:1] in tuple("-0123456789")) + name for name in series]
-    thing = frame.plural(options.by) + (f" and {frame.plural(second)}" if second else "")
+    thing = plural(options.by) + (f" and {plural(second)}" if second else "")
     apart = {called(options.beside): counts("", beside)} if options.beside and len(beside) else {}
     text = list[str]()
     if form == "map":
@@ -79,19 +284,19 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
             for row, each in cells.items()
             for name, tally in zip(of_series, each, strict=True)
         ]
-        text += frame.extremes(pairs, "The lowest pair", "the highest", f"pairs of {thing}", verb)
+        text += extremes(pairs, "The lowest pair", "the highest", f"pairs of {thing}", verb)
     else:
         where = f" where {options.what}" if middles else ""
         for number, name in enumerate(series):
             along = [each[number].called(row) for row, each in cells.items()]
             if len(series) < 2 or sum(tally.total > 0 for tally in along) > 1:  # of one row all is said below
                 worst = f"For {name}, lowest" if len(series) > 1 else "Lowest"
-                text += frame.extremes(along, f"{worst}{where}", f"highest{where}", frame.plural(options.by), verb)
+                text += extremes(along, f"{worst}{where}", f"highest{where}", plural(options.by), verb)
     if second and len(series) > 1:  # in one text, so that figures by other columns do not repeat it
         overall = [tally.called(f"that of {name}") for name, tally in zip(of_series, totals, strict=True)]
-        of_all = frame.extremes(overall, "Over all, the lowest share", "the highest", frame.plural(second), verb)
+        of_all = extremes(overall, "Over all, the lowest share", "the highest", plural(second), verb)
         text.append(" ".join(of_all))
-    for number, name in enumerate(series[1:] if options.wrong and second == frame.MODEL else (), start=1):
+    for number, name in enumerate(series[1:] if options.wrong and second == MODEL else (), start=1):
         # the mean over rows of each model's errors over those of the first; rows without any of that are left out
         if ratios := [(each[number].share or 0.0) / each[0].share for each in cells.values() if each[0].share]:
             mean = 100.0 * sum(ratios) / len(ratios)
@@ -112,7 +317,7 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
             axes.set(ylabel=options.by, xlabel=second or "")
         elif form == "lines":
             _draw_lines(axes, cells, series, middles or range(len(cells)))
-            unit = frame.unit_of(rows, options.by)
+            unit = unit_of(rows, options.by)
             across = f"{options.what} [{unit[1:]}]" if unit else options.what
             axes.set(xlabel=across, ylabel=f"{label} with 95 % interval")
         else:
@@ -126,14 +331,14 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
     if form == "map":
         size = max(2.8 + 0.42 * len(series), 5.4), 1.9 + 0.28 * len(cells)
     title = f"{'Error' if options.wrong else 'Accuracy'} by {thing}"
-    return MadeFigure(title, text, [options.by, *([second] if second else []), verb, *frame.COUNT], table, draw, size)
+    return MadeFigure(title, text, [options.by, *([second] if second else []), verb, *COUNT], table, draw, size)
 
 
 def _groups(rows: Rows, options: RatesOptions) -> tuple[Mapping[str, Rows], list[float] | None]:
     """The rows by their values, or by the parts of a range with the middle of each."""
     if options.bins is None and options.form != "lines":
-        return frame.by(rows, options.by), None
-    values, bins, unit = frame.numbers(rows, options.by), options.bins or BINS, frame.unit_of(rows, options.by)
+        return by(rows, options.by), None
+    values, bins, unit = numbers(rows, options.by), options.bins or BINS, unit_of(rows, options.by)
     if options.away_from is not None:
         values = (values - options.away_from).abs()
         if options.turn is not None:  # the shorter way round
@@ -193,15 +398,15 @@ class AgreementOptions(Options):
 
 def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
     """Count in how many pairs the model is right, or wrong, about a rendering and another picture of the same alike."""
-    renderings = rows[rows[frame.PART] == options.of[0]].dropna(axis=1, how="all")
+    renderings = rows[rows[PART] == options.of[0]].dropna(axis=1, how="all")
     if renderings.empty:
         raise InputError(f"figures: agreement: expected predictions of a part {options.of[0]!r}, got none")
-    of_each = {frame.PREDICTION, frame.PART, "correct", "margin", "time", "unit"}
+    of_each = {PREDICTION, PART, "correct", "margin", "time", "unit"}
     shared = [name for name in renderings if name not in of_each]  # the values of renderings; others may have more
-    text, table, series = list[str](), list[list[frame.Cell]](), list[str]()
+    text, table, series = list[str](), list[list[Cell]](), list[str]()
     bars: dict[str, list[Tally]] = {thing: [] for thing in (ALL, *renderings["object"].unique())}
     for part in (PHOTOGRAPHS, *options.of[1:]):
-        others, name = rows[rows[frame.PART] == part], options.names.get(part, part)
+        others, name = rows[rows[PART] == part], options.names.get(part, part)
         pairs = others.merge(renderings, on=shared, suffixes=("", " rendered"))
         alone = len(others) - len(pairs)
         if part == PHOTOGRAPHS and others.empty:
@@ -214,7 +419,7 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
             some = pairs if thing == ALL else pairs[pairs["object"] == thing]
             first, second = some["correct rendered"], some["correct"]
             four = [int(((first == a) & (second == b)).sum()) for a in (True, False) for b in (True, False)]
-            same = int((some[f"{frame.PREDICTION} rendered"] == some[frame.PREDICTION]).sum())
+            same = int((some[f"{PREDICTION} rendered"] == some[PREDICTION]).sum())
             tallies.append(tally := Tally.over(thing, some, first == second))
             table.append([name, thing, *four, same, *tally.cells])
             if thing == ALL and len(some):
@@ -236,7 +441,7 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
         figure.legend(loc="outside lower center", ncols=1)
 
     four_heads = ["right, right", "right, wrong", "wrong, right", "wrong, wrong"]
-    heads = ["rendering and", "object", *four_heads, "same prediction", "agree", *frame.COUNT]
+    heads = ["rendering and", "object", *four_heads, "same prediction", "agree", *COUNT]
     size = 6.0, 1.7 + 0.2 * len(series) + 0.34 * (len(bars) - 1)
     return MadeFigure("Renderings and other pictures of the same", text, heads, table, draw, size)
 
@@ -251,13 +456,13 @@ def _where(right: bool, pairs: Rows) -> str:
 
 def scaling(rows: Rows, options: Options) -> MadeFigure:
     """Measure the pictures a second of sweeps by the number of workers that shared them."""
-    if frame.WORKERS not in rows:
+    if WORKERS not in rows:
         raise InputError("figures: scaling: expected sweeps with `workers` among the parts, got none")
     # without rows of sweeps that say none
-    runs = rows.groupby([frame.WORKERS, "object"], sort=False)["time"].agg(_rate)
+    runs = rows.groupby([WORKERS, "object"], sort=False)["time"].agg(_rate)
     by_count = {int(workers): found.droplevel(0) for workers, found in runs.groupby(level=0)}
     fewest, slowest = next(iter(by_count.items()))
-    text, table = list[str](), list[list[frame.Cell]]()
+    text, table = list[str](), list[list[Cell]]()
     for workers, found in by_count.items():
         gains = (found / slowest.reindex(found.index)).dropna()
         table += [[workers, str(name), float(rate), gains.get(name)] for name, rate in found.items()]
@@ -319,7 +524,7 @@ def surface(rows: Rows, options: Options) -> MadeFigure:
             axes.imshow(imread(rows.attrs["folder"] / PARTS / run / IMAGES / "surface.png"))
             axes.axis("off")
 
-    table: list[list[frame.Cell]] = [
+    table: list[list[Cell]] = [
         [part.object, short_name(part.model), part.part, part.seen, part.compared, part.worse, part.better]
         for found in surfaces.values()
         for part in found.tables

@@ -11,8 +11,7 @@ from pydantic import Field, JsonValue, field_validator
 
 from advsearch.config import SceneConfig, read_joined
 from advsearch.files import MESHES, either
-from advsearch.report.markup import InNotebook
-from advsearch.report.shown import ResultPart, ShownResult
+from advsearch.report.shown import InNotebook, ResultPart, ShownResult
 from advsearch.report.wording import count, percent, short_name
 from advsearch.runs.results import Fields, RunResult
 from advsearch.settings import Clash, Config, setting, setting_as_in, split_names

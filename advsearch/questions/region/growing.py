@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks.draws import batches
+from advsearch.attacks.domain import batches
 from advsearch.attacks.evaluation import most_at_once
 from advsearch.attacks.trials import clopper_pearson
 from advsearch.engine.journal import Journal, Shared

@@ -9,8 +9,7 @@ from pydantic import Field
 
 from advsearch.config import DerivativeConfig, SceneConfig
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.report.markup import InNotebook
-from advsearch.report.shown import Claim, Column, ResultPart, ShownResult, claim, counted, share_text
+from advsearch.report.shown import Claim, Column, InNotebook, ResultPart, ShownResult, claim, counted, share_text
 from advsearch.report.wording import percent
 from advsearch.runs.results import (
     CleanScene,

@@ -11,8 +11,7 @@ from pydantic import Field, field_validator
 from advsearch.config import SceneConfig
 from advsearch.questions.attack.settings import FEWEST_TRIALS
 from advsearch.report import wording
-from advsearch.report.markup import InNotebook
-from advsearch.report.shown import Claim, ResultPart, ShownResult, case_claim
+from advsearch.report.shown import Claim, InNotebook, ResultPart, ShownResult, case_claim
 from advsearch.runs.results import ControlGroup, Fields, SceneResult, VerifiedRate
 from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.cli import output
-from advsearch.cli.commands import PlainCommand
+from advsearch.cli.main import PlainCommand
 from advsearch.errors import InputError
 
 HELP = "write what runs show, and no more than that, for a model card or a safety case"
@@ -46,8 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Write the files."""
     # late, so that --help answers at once
-    from advsearch.questions.report.engineering import read_exposure
-    from advsearch.questions.report.evidence import collected
+    from advsearch.questions.report.evidence import collected, read_exposure
     from advsearch.questions.report.result import evidence_page, markdown
     from advsearch.runs.files import write_bytes, write_text
     from advsearch.runs.summary import to_json

@@ -8,8 +8,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.report.markup import Html, element, join_html
-from advsearch.report.shown import Claim
+from advsearch.report.shown import Claim, Html, element, join_html
 from advsearch.report.wording import count, interval_text
 from advsearch.runs.results import Fields, Interval, Result
 from advsearch.viewer.document import data_url, document, heading, study_table

@@ -14,8 +14,7 @@ from pydantic import Field
 
 from advsearch.config import SceneConfig, TimedConfig
 from advsearch.errors import AdvsearchError
-from advsearch.report.markup import InNotebook
-from advsearch.report.shown import Column, ResultPart, ShownResult
+from advsearch.report.shown import Column, InNotebook, ResultPart, ShownResult
 from advsearch.runs.results import Fields, JsonFloat, Result, having
 from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
 

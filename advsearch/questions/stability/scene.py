@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks import PGD, Domain, Evaluation, Query, SearchResult, search
 from advsearch.controls import Space, make_control, make_space
-from advsearch.engine import objective
+from advsearch.engine import judging
 from advsearch.engine.gradients import Loss, derivatives, smooth_loss
 from advsearch.questions.stability.result import Outcome, check, holds
 from advsearch.runs.results import Measured
@@ -256,7 +256,7 @@ def search_domain(renderer: Renderer, start: Tensor | None = None) -> Domain:
     """Return where a search of a renderer's space may look, from its start or another one."""
     space = renderer.space
     assert isinstance(space, Space)
-    return objective.domain_of(
+    return judging.domain_of(
         space.controls,
         renderer.start if start is None else start,
         gradient_cost=renderer.plan.renders,

@@ -61,7 +61,7 @@ from advsearch.scene.surfaces import aovs_of
 from advsearch.scene.things import ALL
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
-from advsearch.tasks.each_thing import each_thing
+from advsearch.tasks.together import each_thing
 
 OUTER = ("object", "environment")
 OF_A_SCENE = ("object", "environment", "up", "size", "unit", "camera", "things", "set_", "exposure")

@@ -21,7 +21,7 @@ from advsearch.questions.sweep.job import Job, OpenScenes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import DriveRates, OneDrive, OverDrives, TrackRates
 from advsearch.questions.sweep.tracks import DetectedFrame, frame_of, tracked
-from advsearch.report.marks import marked
+from advsearch.report.figures import marked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.tasks import Detection

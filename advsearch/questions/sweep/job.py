@@ -12,21 +12,18 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Evaluation, Query, Trials, run_trials
-from advsearch.attacks.draws import Seeds
+from advsearch.attacks.domain import Seeds
 from advsearch.controls import Control, Space, make_control, make_space
 from advsearch.described import Value
-from advsearch.engine.changes import AWAY, as_claimed, changed
 from advsearch.engine.journal import Journal, Sent, Shared
-from advsearch.engine.judging import Looked, Metrics, check_truth, facts_of
+from advsearch.engine.judging import Looked, Metrics, check_truth, domain_of, facts_of
 from advsearch.engine.loading import Scene, framed, make_renderer
-from advsearch.engine.objective import domain_of
-from advsearch.engine.problem import Prepared, Problem
+from advsearch.engine.problem import AWAY, Prepared, Problem, as_claimed, changed
 from advsearch.engine.record import Stages, rate_of
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError
 from advsearch.models import Model
-from advsearch.questions.sweep.axes import Axis, on_grid
-from advsearch.questions.sweep.points import Drawn, Points
+from advsearch.questions.sweep.axes import Axis, Drawn, Points, on_grid
 from advsearch.questions.sweep.predicting import PredictedSweep, SweptPicture
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import WorstVerified

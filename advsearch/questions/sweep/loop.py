@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.attacks.draws import batches
+from advsearch.attacks.domain import batches
 from advsearch.attacks.units import most_shown
 from advsearch.cluster import Executor, InProcess
 from advsearch.engine.journal import Journal, Sent, Shared, finite, lost, other_numbers, same, worker_call
@@ -42,12 +42,10 @@ from advsearch.questions.sweep.summary import WorstConfiguration, WorstVerified
 from advsearch.questions.sweep.surface import map_surface
 from advsearch.report.wording import count
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
-from advsearch.runs.files import write_bytes
-from advsearch.runs.images import write_layers
+from advsearch.runs.files import write_bytes, write_layers
 from advsearch.runs.results import DescribedValue, Formation, LinearTransport, SharedWork
 from advsearch.runs.store import Row
-from advsearch.runs.tables import EDGES
-from advsearch.runs.units import NOTE
+from advsearch.runs.tables import EDGES, NOTE
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 

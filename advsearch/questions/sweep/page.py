@@ -20,7 +20,7 @@ from advsearch.files import JsonObject, JsonValue
 from advsearch.questions.sweep import display as sweeps
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
-from advsearch.report.markup import Html, element, join_html
+from advsearch.report.shown import Html, element, join_html
 from advsearch.report.shown import shown as shown_of
 from advsearch.report.wording import beside_text, prediction_text
 from advsearch.runs import directory

@@ -15,12 +15,11 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Query
-from advsearch.attacks.draws import Product
+from advsearch.attacks.domain import Product
 from advsearch.engine.acceptance import CHECK_SPP, VIEWS, ComparedView, Deviation, compared, view_of
 from advsearch.engine.problem import Problem
 from advsearch.files import scaled
-from advsearch.questions.sweep.axes import Axis
-from advsearch.questions.sweep.points import Points
+from advsearch.questions.sweep.axes import Axis, Points
 from advsearch.runs.results import LinearTransport, PredictionError
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.formation import to_8_bit

@@ -25,13 +25,11 @@ from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.summary import AxisRow, CountedPredictions, MapAxis, PairedRates, SweepMap, SweepSummary
 from advsearch.report.figures import new_axes
-from advsearch.report.markup import result_html
-from advsearch.report.shown import shown
+from advsearch.report.shown import result_html, shown
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory, default_name
 from advsearch.runs.export import read_threedb
-from advsearch.runs.tables import read_sweep, to_pandas
-from advsearch.runs.units import Units
+from advsearch.runs.tables import Units, read_sweep, to_pandas
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 

@@ -18,7 +18,7 @@ import torch
 from scipy.special import xlogy
 
 from advsearch import seeds
-from advsearch.attacks.draws import batches
+from advsearch.attacks.domain import batches
 from advsearch.attacks.trials import wilson
 from advsearch.engine.loading import framed, load_scene
 from advsearch.engine.record import judgement_of

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
-from advsearch.cli.commands import Positional, QuestionCommand
+from advsearch.cli.main import Positional, QuestionCommand
 from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 

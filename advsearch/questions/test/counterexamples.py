@@ -31,8 +31,7 @@ from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.test.result import HELD, VERDICTS
 from advsearch.questions.test.settings import OWN, Suite
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, default_name, find_run
-from advsearch.runs.files import write_bytes, write_text
-from advsearch.runs.images import read_png
+from advsearch.runs.files import read_png, write_bytes, write_text
 from advsearch.settings import FILES, settings
 from advsearch.viewer.thumbnails import thumbnail
 

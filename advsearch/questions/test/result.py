@@ -18,8 +18,7 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim
-from advsearch.report.markup import InNotebook
-from advsearch.report.shown import Claim, Kind, Picture, ResultPart, ShownResult
+from advsearch.report.shown import Claim, InNotebook, Kind, Picture, ResultPart, ShownResult
 from advsearch.report.wording import count, interval_text, number_text, percent, seconds_text, short_name, with_article
 from advsearch.runs.results import INTERRUPTED, RUNNING, Fields, Interval, JsonFloat, RunResult
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -9,8 +11,7 @@ from functools import cached_property
 import numpy as np
 from PIL import Image
 
-from advsearch.scene.assets import Doubles, Floats
-from advsearch.scene.importing import mtl, udim
+from advsearch.scene.assets import Doubles, Floats, Ints
 from advsearch.scene.importing.files import Notes, References, plain_name, shown, text_of
 from advsearch.scene.importing.parts import (
     NEUTRAL,
@@ -41,8 +42,8 @@ class Painted:
     """A material that was read."""
 
     surface: ImportedSurface  # what it looks like
-    scale: mtl.Pair = (1.0, 1.0)  # factors of texture coordinates
-    offset: mtl.Pair = (0.0, 0.0)  # what is added to them then
+    scale: Pair = (1.0, 1.0)  # factors of texture coordinates
+    offset: Pair = (0.0, 0.0)  # what is added to them then
     clamped: bool = False  # whether its textures are not to repeat
 
 
@@ -55,9 +56,9 @@ class MtlReader:
     notes: Notes
     shown_on: Callable[[str, int], tuple[Doubles, Doubles]]
     libraries: int = 0  # how many material files were read
-    _materials: dict[str, mtl.MtlMaterial] = field(default_factory=dict)
+    _materials: dict[str, MtlMaterial] = field(default_factory=dict)
     _painted: dict[tuple[int, int], Painted] = field(default_factory=dict)
-    _uses: dict[tuple[int, str], mtl.MapUse | None] = field(default_factory=dict)
+    _uses: dict[tuple[int, str], MapUse | None] = field(default_factory=dict)
 
     def read_library(self, name: str) -> None:
         """Read a material file; of materials with the same name, the first counts."""
@@ -70,7 +71,7 @@ class MtlReader:
             return
         self.libraries += 1
         file = plain_name(name).rpartition("/")[2]
-        materials, stray = mtl.parsed(text, file)
+        materials, stray = parsed(text, file)
         for key in stray:
             self.notes.has(f"before the first material of {shown(file, quoted=False)}, statement", key)
         for material in materials:
@@ -78,10 +79,10 @@ class MtlReader:
             if first.statements != material.statements and first.file == material.file:
                 self.notes.say(f"{file} has the material {shown(material.name)} more than once; the first counts")
         for material in materials:  # a comment, or part of the name: both are tried
-            self._materials.setdefault(mtl.without_comment(material.name), material)
+            self._materials.setdefault(without_comment(material.name), material)
 
-    def _named(self, name: str) -> mtl.MtlMaterial | None:
-        return self._materials.get(name) or self._materials.get(mtl.without_comment(name))
+    def _named(self, name: str) -> MtlMaterial | None:
+        return self._materials.get(name) or self._materials.get(without_comment(name))
 
     def painted(self, name: str, square: int = 0) -> Painted | None:
         """Return a material by its name, or None; the name may have a comment after it. Of pictures of one UDIM square
@@ -98,12 +99,12 @@ class MtlReader:
         material whose pictures have no square in their names, or repeat."""
         material = self._named(name)
         maps = [use for key in PLACED if material is not None and (use := self._use(material, key)) is not None]
-        numbered = next((use.name for use in maps if udim.number_in(use.name) is not None), None)
+        numbered = next((use.name for use in maps if number_in(use.name) is not None), None)
         if numbered is None:
             return []
-        others = [square for square in wanted if square and square != udim.number_in(numbered)]
-        beside = (isinstance(self.references.tried(udim.named(numbered, square)), bytes) for square in others)
-        if others and (udim.number_in(numbered) == 0 or any(beside)):
+        others = [square for square in wanted if square and square != number_in(numbered)]
+        beside = (isinstance(self.references.tried(named(numbered, square)), bytes) for square in others)
+        if others and (number_in(numbered) == 0 or any(beside)):
             return [square for square in wanted if square]
         if others:
             self.notes.say(
@@ -112,20 +113,20 @@ class MtlReader:
             )
         return []
 
-    def _look_of(self, material: mtl.MtlMaterial, square: int, name: str) -> Painted:
+    def _look_of(self, material: MtlMaterial, square: int, name: str) -> Painted:
         if not any(known == id(material) for known, _ in self._painted):
             self._list(material)
         uses = {key: use for key in (*PLACED, "map_pr", "map_pm") if (use := self._use(material, key)) is not None}
         if square:
-            uses = {key: replace(use, name=udim.named(use.name, square)) for key, use in uses.items()}
-        first = next((uses[key] for key in PLACED if key in uses), mtl.MapUse("", {}))
+            uses = {key: replace(use, name=named(use.name, square)) for key, use in uses.items()}
+        first = next((uses[key] for key in PLACED if key in uses), MapUse("", {}))
         for key in [key for key in PLACED if key in uses]:
             if (uses[key].scale, uses[key].offset) != (first.scale, first.offset):
                 what = f"{material.spelled[key]} of the material {shown(material.name)}"
                 self.notes.say(f"{what} lies elsewhere than its other maps (-s, -o); it is left out")
                 del uses[key]
         rest = material.numbers("kd")
-        color = mtl.color_of(rest)
+        color = color_of(rest)
         if "kd" in material.statements and color is None:
             what = f"the Kd {shown(rest)} of the material {shown(material.name)}"
             self.notes.say(f"{what} is no colour; neutral grey is used instead")
@@ -142,17 +143,17 @@ class MtlReader:
         clamped = bool(first.name) and any(use.options.get("clamp", "").lower() == "on" for use in uses.values())
         return Painted(look, first.scale, first.offset, clamped)
 
-    def _list(self, material: mtl.MtlMaterial) -> None:
+    def _list(self, material: MtlMaterial) -> None:
         """Put what is not read into the inventory; what is there by default, and changes nothing, is not in it."""
-        said = {key: mtl.without_comment(rest) for key, rest in material.statements.items()}
-        zero = {key for key in said if not any(mtl.numbers_of(material.numbers(key)) or [1.0])}
+        said = {key: without_comment(rest) for key, rest in material.statements.items()}
+        zero = {key for key in said if not any(numbers_of(material.numbers(key)) or [1.0])}
         for key in material.again:
             self.notes.has("earlier material statement", key)
         if len(material.numbers("kd").split()) == 4:
             self.notes.has("fourth number of", material.spelled["kd"])
-        base = mtl.map_of(said.get("map_kd", ""))
+        base = map_of(said.get("map_kd", ""))
         for key, rest in said.items():
-            use = mtl.map_of(rest)
+            use = map_of(rest)
             quiet = key in READ or key in QUIET or key in zero or (key == "pcr" and "pc" in zero)
             quiet |= key == "tf" and len(set(rest.split())) == 1
             quiet |= key == "map_ka" and use is not None and base is not None and use.name == base.name
@@ -161,12 +162,12 @@ class MtlReader:
             elif not quiet:
                 self.notes.has("material statement", material.spelled[key])
 
-    def _use(self, material: mtl.MtlMaterial, key: str) -> mtl.MapUse | None:
+    def _use(self, material: MtlMaterial, key: str) -> MapUse | None:
         """Return what a statement says that names a picture, and put options that are not read into the inventory."""
         if (id(material), key) in self._uses:
             return self._uses[id(material), key]
         rest = material.statements.get(key, "")
-        use, whole = mtl.map_of(mtl.without_comment(rest)), mtl.map_of(rest)
+        use, whole = map_of(without_comment(rest)), map_of(rest)
         if whole is not None and whole != use and isinstance(self.references.tried(whole.name), bytes):
             use = whole  # the # belongs to the name
         self._uses[id(material), key] = use
@@ -178,14 +179,12 @@ class MtlReader:
             elif option == "imfchan" and colors:
                 quiet = False
             else:
-                quiet = (
-                    option in taken or value.lower() == DEFAULTS.get(option) or not any(mtl.numbers_of(value) or [1.0])
-                )
+                quiet = option in taken or value.lower() == DEFAULTS.get(option) or not any(numbers_of(value) or [1.0])
             if not quiet:
                 self.notes.has("texture option", f"-{option} of {material.spelled[key]}")
         return use
 
-    def _texture(self, material: mtl.MtlMaterial, use: mtl.MapUse | None, color: Floats | None) -> Floats | None:
+    def _texture(self, material: MtlMaterial, use: MapUse | None, color: Floats | None) -> Floats | None:
         """Return the base colour texture. It stands alone: a Kd beside it is an exporter's default more often than a
         tint."""
         instead = f"{instead_of_texture(color)} is used instead"
@@ -197,9 +196,7 @@ class MtlReader:
             self.notes.say(f"the alpha of {shown(use.name)} is left out: no map_d makes it an opacity")
         return np.ascontiguousarray(picture[:, :, :3])
 
-    def _see_through(
-        self, material: mtl.MtlMaterial, use: mtl.MapUse | None, surface: ImportedSurface
-    ) -> ImportedSurface:
+    def _see_through(self, material: MtlMaterial, use: MapUse | None, surface: ImportedSurface) -> ImportedSurface:
         """Give a surface its opacity: ``d``, a number, or ``Tr``, and ``map_d``, a picture."""
         factor = self._opacity(material)
         picture = self._picture(use, "colours and alpha", "the opacity {name} {why}; it is opaque instead")
@@ -217,11 +214,11 @@ class MtlReader:
             texture = np.concatenate([texture, fitted[:, :, None]], axis=2)
         return replace(surface, color=with_opacity(color, share, None), texture=with_opacity(texture, share, None))
 
-    def _opacity(self, material: mtl.MtlMaterial) -> float:
+    def _opacity(self, material: MtlMaterial) -> float:
         """Return ``d``, or 1 - ``Tr`` where there is none; some programs write Tr for d."""
         if "-halo" in material.numbers("d").lower().split():
             self.notes.has("option", "-halo of d")
-        opacity, clear = mtl.share_of(material.numbers("d"), -1.0), mtl.share_of(material.numbers("tr"), -1.0)
+        opacity, clear = share_of(material.numbers("d"), -1.0), share_of(material.numbers("tr"), -1.0)
         what = f"the material {shown(material.name)} has Tr {clear:g}"
         if opacity >= 0.0:
             if clear >= 0.0 and min(abs(clear - opacity), abs(1.0 - clear - opacity)) > 0.01:
@@ -234,9 +231,7 @@ class MtlReader:
             )
         return 1.0 - max(clear, 0.0)
 
-    def _share(
-        self, material: mtl.MtlMaterial, key: str, use: mtl.MapUse | None, name: str, square: int
-    ) -> float | None:
+    def _share(self, material: MtlMaterial, key: str, use: MapUse | None, name: str, square: int) -> float | None:
         """Return a roughness or metallic: the mean of its map over the faces that show it, or else its number; None
         where there is neither."""
         words = f"{material.spelled.get(f'map_{key}')} {{name}} {{why}}; it is left out"
@@ -245,10 +240,10 @@ class MtlReader:
             self.notes.say("textures of roughness and metallic are replaced by their means")
             uvs, areas = self.shown_on(name, square)
             return float(mean_over(_channel(picture, use)[:, :, None], uvs * use.scale + use.offset, areas)[0])
-        value = mtl.share_of(material.numbers(key), -1.0)
+        value = share_of(material.numbers(key), -1.0)
         return value if value >= 0.0 else None
 
-    def _bumps(self, uses: dict[str, mtl.MapUse]) -> Floats | None:
+    def _bumps(self, uses: dict[str, MapUse]) -> Floats | None:
         """Return the normal map: ``norm``, or ``map_Bump`` or ``bump`` where these hold normals."""
         words = "the normal map {name} {why}; it is left out"
         for key, use in ((key, uses[key]) for key in NORMALS if key in uses):
@@ -259,10 +254,10 @@ class MtlReader:
                 self._pictures.lacks(use.name, "holds heights, and no normals", words)
         return None
 
-    def _glow(self, material: mtl.MtlMaterial, use: mtl.MapUse | None) -> Floats | None:
+    def _glow(self, material: MtlMaterial, use: MapUse | None) -> Floats | None:
         """Return the radiance that is said by ``Ke`` and ``map_Ke``; where there are both, their product."""
         rest = material.numbers("ke")
-        factor = mtl.radiance_of(rest)
+        factor = radiance_of(rest)
         if factor is None:
             self.notes.say(f"the emission {shown(rest)} is no colour; it is left out")
             return None
@@ -277,7 +272,7 @@ class MtlReader:
     def _pictures(self) -> FilePictures:
         return FilePictures(len(self._materials), self.references, self.notes)
 
-    def _picture(self, use: mtl.MapUse | None, kind: Kind, words: str) -> Floats | None:
+    def _picture(self, use: MapUse | None, kind: Kind, words: str) -> Floats | None:
         """Return a picture's values with its ``-mm`` applied; None where there is none, or it cannot be had."""
         picture = None if use is None else self._pictures.of_file(use.name, kind, words)
         if use is None or picture is None or use.range == (0.0, 1.0):
@@ -286,7 +281,7 @@ class MtlReader:
         return np.concatenate([np.clip(picture[:, :, :3] * gain + base, 0.0, 1.0), picture[:, :, 3:]], axis=2)
 
 
-def _channel(picture: Floats, use: mtl.MapUse) -> Floats:
+def _channel(picture: Floats, use: MapUse) -> Floats:
     """Return the (H, W) values that a picture holds for a map of numbers: of the channel that ``-imfchan`` names, or
     else its alpha, or its grey where it has none."""
     number = CHANNELS.get(use.options.get("imfchan", "").lower())
@@ -301,7 +296,7 @@ def libraries_of(rests: Sequence[str], references: References) -> list[str]:
     blanks: a line that is the name of a file is that, else each name ends in ``.mtl``, else in a blank."""
     names: list[str] = []
     for rest in rests:
-        plain = mtl.without_comment(rest)
+        plain = without_comment(rest)
         for line in (rest, plain):
             if isinstance(references.tried(line), bytes):
                 names.append(line)
@@ -316,3 +311,177 @@ def libraries_of(rests: Sequence[str], references: References) -> list[str]:
             ended = all(part.strip('"').lower().endswith(".mtl") for part in parts)
             names += parts if ended or any(isinstance(references.tried(part), bytes) for part in parts) else [plain]
     return list(dict.fromkeys(filter(None, names)))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# UDIM: one picture for each unit square of texture coordinates, with the square's number in its name.
+#
+# The square from (0, 0) is 1001, those to its right count on to 1010, and each row above adds 10.
+
+FIRST, ACROSS = 1001, 10
+_NUMBER = re.compile(r"(?<!\d)1\d{3}(?=\.\w+$)")
+_PLACE = re.compile(r"<UDIM>", re.IGNORECASE)
+
+
+def number_in(name: str) -> int | None:
+    """Return the number of the square that a picture's name has; 0 where it has ``<UDIM>`` in its place, else None."""
+    if _PLACE.search(name):
+        return 0
+    found = _NUMBER.search(name)
+    return int(found[0]) if found and int(found[0]) >= FIRST else None
+
+
+def named(name: str, number: int) -> str:
+    """Return the name of the picture of another square."""
+    return _PLACE.sub(str(number), name) if _PLACE.search(name) else _NUMBER.sub(str(number), name)
+
+
+def squares(uvs: Doubles) -> Ints:
+    """Return the numbers (F,) of the squares that the middles of faces, with these UVs (F, 3, 2), lie in; 0 for
+    none."""
+    column, row = np.floor(uvs.mean(axis=1)).T
+    known = (column >= 0) & (column < ACROSS) & (row >= 0) & (row < 100)
+    return np.where(known, FIRST + column + ACROSS * row, 0).astype(np.int64)
+
+
+def corner_of(square: int) -> tuple[int, int]:
+    """Return the texture coordinates at which a square begins; (0, 0) for none."""
+    return ((square - FIRST) % ACROSS, (square - FIRST) // ACROSS) if square else (0, 0)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The grammar of material files (.mtl): statements, comments, and the options of maps.
+#
+# Nothing of a statement's meaning is here; what each says of a surface is read in `mtl_surfaces`.
+
+Pair = tuple[float, float]
+_MTL_NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
+_OPTIONS = {
+    "blendu": "on|off",
+    "blendv": "on|off",
+    "bm": _MTL_NUMBER,
+    "boost": _MTL_NUMBER,
+    "cc": "on|off",
+    "clamp": "on|off",
+    "colorspace": r"\S+",
+    "imfchan": "[rgbmlz]",
+    "mm": rf"{_MTL_NUMBER}\s+{_MTL_NUMBER}",
+    "o": rf"{_MTL_NUMBER}(?:\s+{_MTL_NUMBER}){{0,2}}",
+    "s": rf"{_MTL_NUMBER}(?:\s+{_MTL_NUMBER}){{0,2}}",
+    "t": rf"{_MTL_NUMBER}(?:\s+{_MTL_NUMBER}){{0,2}}",
+    "texres": r"\d+",
+    "type": r"sphere|cube_\w+",
+}
+_OPTION = re.compile(
+    "|".join(rf"(?:(?<=\s)|^)-(?P<{name}>{name})\s+(?P<{name}_>{value})(?=\s|$)" for name, value in _OPTIONS.items()),
+    re.IGNORECASE,
+)
+_UNKNOWN = re.compile(rf"-([a-z]\w*)(?:\s+(?:on|off|{_MTL_NUMBER})(?=\s))*\s+", re.IGNORECASE)
+_COMMENT = re.compile(r"(?:^|(?<=\s))#.*")
+_CONTINUED = re.compile(r"^([^#\n][^\n]*?)\\[ \t]*\n", re.MULTILINE)
+
+
+@dataclass
+class MtlMaterial:
+    """A material as its file has it: the rest of each line by its keyword in lower case (of several lines with the same
+    one, the last), and that as the file spells it."""
+
+    name: str  # as it stands after ``newmtl``, with what may be a comment
+    file: str  # name of the material file
+    statements: dict[str, str] = field(default_factory=dict)
+    spelled: dict[str, str] = field(default_factory=dict)
+    again: list[str] = field(default_factory=list)  # keywords of lines that others come after that say something else
+
+    def numbers(self, key: str) -> str:
+        """Return what a statement of numbers says, without a comment; empty where there is none."""
+        return self.statements.get(key, "").partition("#")[0].strip()
+
+
+@dataclass(frozen=True)
+class MapUse:
+    """A statement that names a picture."""
+
+    name: str  # of the picture, as the file has it
+    options: dict[str, str]  # its options by their names, in lower case, as (name, value)
+    scale: Pair = (1.0, 1.0)  # how often the picture repeats over a unit of u and of v (``-s``)
+    offset: Pair = (0.0, 0.0)  # what is added to scaled texture coordinates (``-o``)
+    range: Pair = (0.0, 1.0)  # what is added to the picture's values, and their factor before (``-mm``)
+    bump: float = 1.0  # the factor of a normal map's x and y (``-bm``)
+
+
+def parsed(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
+    """Return the materials of a material file, and the keywords of statements before the first of them."""
+    materials: list[MtlMaterial] = []
+    stray = []
+    for line in _CONTINUED.sub(r"\1 ", text.replace("\r\n", "\n")).splitlines():
+        key, _, rest = line.strip().replace("\t", " ").partition(" ")
+        if not key or key.startswith("#"):
+            continue
+        if key.lower() == "newmtl":
+            materials.append(MtlMaterial(" ".join(rest.split()), file))
+        elif materials:
+            if materials[-1].statements.get(key.lower(), rest.strip()) != rest.strip():
+                materials[-1].again.append(key)
+            materials[-1].statements[key.lower()] = rest.strip()
+            materials[-1].spelled[key.lower()] = key
+        else:
+            stray.append(key)
+    return materials, stray
+
+
+def without_comment(text: str) -> str:
+    """Return what stands before a ``#`` at the beginning of a word."""
+    return _COMMENT.sub("", text).strip()
+
+
+def map_of(rest: str) -> MapUse | None:
+    """Return what a statement says that names a picture, with options before the name and after it, which may have
+    blanks; None where it names none."""
+    options: dict[str, str] = {}
+    for match in _OPTION.finditer(rest):
+        options.update({key: match[f"{key}_"] for key in _OPTIONS if match[key] is not None})
+    name = " ".join(_OPTION.sub("", rest).split())
+    while unknown := _UNKNOWN.match(name):
+        options[unknown[1].lower()], name = "", name[unknown.end() :]
+    if not name:
+        return None
+    usual = {"s": (1.0, 1.0), "o": (0.0, 0.0), "mm": (0.0, 1.0), "bm": (1.0, 1.0)}
+    scale, offset, values, (bump, _) = (_pair(options.get(key, ""), pair) for key, pair in usual.items())
+    return MapUse(name, options, scale, offset, values, bump)
+
+
+def _pair(text: str, otherwise: Pair) -> Pair:
+    """What an option says, or what holds otherwise, where it says too little or nothing that can be computed with."""
+    words = text.split()[:2]
+    u, v = (*map(float, words), *otherwise[len(words) :])
+    return (u, v) if abs(u) < 1e6 and abs(v) < 1e6 else otherwise
+
+
+def color_of(rest: str) -> Floats | None:
+    """Return a colour (3,) float32, clipped to [0, 1], of one number, three, or four of which three count; or None."""
+    values = numbers_of(rest)
+    if values is None or len(values) not in (1, 3, 4):
+        return None
+    color: Floats = np.clip(np.broadcast_to(values[:3], (3,)), 0.0, 1.0).astype(np.float32)
+    return color
+
+
+def radiance_of(rest: str) -> Doubles | None:
+    """Return one or three numbers of at least 0 as a colour (3,), black where there are none; None for other words."""
+    values = numbers_of(rest or "0")
+    return np.broadcast_to(values, (3,)) if values is not None and len(values) in (1, 3) and min(values) >= 0 else None
+
+
+def numbers_of(rest: str) -> list[float] | None:
+    """Return the finite numbers that a statement consists of; None where it has other words, or none."""
+    try:
+        values = [float(word) for word in rest.split()]
+    except ValueError:
+        return None
+    return values if values and all(map(math.isfinite, values)) else None
+
+
+def share_of(rest: str, otherwise: float) -> float:
+    """Return the last word as a number, in [0, 1], or what holds otherwise; `d` has options before it."""
+    values = numbers_of(" ".join(rest.split()[-1:]))
+    return otherwise if values is None else min(max(values[0], 0.0), 1.0)

@@ -23,19 +23,28 @@ from scipy.spatial import ConvexHull, QhullError
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import MESHES
 from advsearch.pictures import without_pillows_limit
-from advsearch.scene.assets import Doubles, Floats, Material, Mesh, ObjectAsset, UpAxis, grouped, normalised
+from advsearch.scene.assets import (
+    LARGEST,
+    SMALLEST,
+    Doubles,
+    Floats,
+    Material,
+    Mesh,
+    ObjectAsset,
+    UpAxis,
+    grouped,
+    normalised,
+)
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing import gltf, gltf_left_out
-from advsearch.scene.importing.blender import read_mesh_bytes
+from advsearch.scene.importing import gltf, gltf_parts
+from advsearch.scene.importing.blender import USD, read_mesh_bytes
 from advsearch.scene.importing.files import Notes, check_faces, damaged, looks_like, safe_name, shown, text_of
 from advsearch.scene.importing.geometry import UPRIGHT, Soup, assemble, extent_of, join, repaired
 from advsearch.scene.importing.gltf_parts import read_gltf
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, visible
 from advsearch.scene.importing.ply import read_ply
 from advsearch.scene.importing.texture import by_material, textured
-from advsearch.scene.importing.usd import USD
 from advsearch.scene.importing.wavefront import read_obj
-from advsearch.scene.sizes import LARGEST, SMALLEST
 
 Attributes = npt.NDArray[np.uint16]
 _FACET = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -158,7 +167,7 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     file = Path(path)
     data = read_mesh_bytes(file, "object", MESHES)
     parts, notes = read_parts(file, data)
-    notes += gltf_left_out.beside(gltf.read_header(file, data), file.name) if file.suffix.lower() in GLTF else []
+    notes += gltf_parts.beside(gltf.read_header(file, data), file.name) if file.suffix.lower() in GLTF else []
     return object_of(parts, notes, file, safe_name(file), up)
 
 

@@ -26,10 +26,10 @@ from advsearch.scene.importing.files import (
     shown,
     text_of,
 )
+from advsearch.scene.importing.geometry import cut_up
 from advsearch.scene.importing.other_formats import SPLATS
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, alike, split_at_corners
 from advsearch.scene.importing.pictures import FilePictures
-from advsearch.scene.importing.polygons import cut_up
 
 Numbers = npt.NDArray[np.generic]
 _TYPES = {

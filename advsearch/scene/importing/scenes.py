@@ -18,15 +18,14 @@ import numpy as np
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import MESHES
 from advsearch.scene.assets import Doubles, ObjectAsset, face_vectors, footing
-from advsearch.scene.importing import gltf, gltf_left_out
-from advsearch.scene.importing.blender import read_mesh_bytes
+from advsearch.scene.importing import gltf, gltf_parts
+from advsearch.scene.importing.blender import GENERATOR, read_mesh_bytes
 from advsearch.scene.importing.files import Names, clean, safe_name, shown
 from advsearch.scene.importing.geometry import FLAT, UPRIGHT
 from advsearch.scene.importing.gltf_entries import CameraEntry, Header, LightEntry
 from advsearch.scene.importing.gltf_skeleton import poses
 from advsearch.scene.importing.objects import GLTF, object_of, read_parts
 from advsearch.scene.importing.parts import ImportedPart, visible
-from advsearch.scene.importing.usd import GENERATOR
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
 from advsearch.scene.skeleton import with_above
 
@@ -101,7 +100,7 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         name: _camera(path, name, header.cameras[header.nodes[index].camera or 0], places[index], frame)
         for index, name in _camera_names(header, places).items()
     }
-    notes.extend(gltf_left_out.lights_and_cameras(header, path.name))
+    notes.extend(gltf_parts.lights_and_cameras(header, path.name))
     whole = object_of(chosen_parts, notes, path, f"{safe_name(path)}-{clean(node)}", "y")
     return ImportedScene(whole, tuple(surroundings), cameras)
 
@@ -158,7 +157,7 @@ def contents(path: Path) -> Contents:
     if path.suffix.lower() not in GLTF:
         return Contents(object_of(parts, notes, path, safe_name(path), None))
     header = gltf.read_header(path, data)
-    notes += gltf_left_out.lights_and_cameras(header, path.name)
+    notes += gltf_parts.lights_and_cameras(header, path.name)
     whole = object_of(parts, notes, path, safe_name(path), None)
     nodes: dict[int, list[ImportedPart]] = {}
     for part in parts:
@@ -235,7 +234,7 @@ def _lamp(
     power = np.array(light.color) * light.intensity / unit
     if light.type == "directional":
         way = UPRIGHT @ pose[:3, 2]  # it shines along its -z
-        place, power = gltf_left_out.FAR * way / max(float(np.linalg.norm(way)), 1e-12), power * gltf_left_out.FAR**2
+        place, power = gltf_parts.FAR * way / max(float(np.linalg.norm(way)), 1e-12), power * gltf_parts.FAR**2
     else:
         place, power = frame.inside(UPRIGHT @ pose[:3, 3]), power / frame.size**2
     if not (np.abs([*place, *power]) <= FURTHEST).all():  # NaN is not

@@ -1,4 +1,4 @@
-"""OpenUSD stages as binary glTF, by `usd-core` in a process of its own (`usd.converted`), which this module is run in.
+"""OpenUSD stages as binary glTF, by `usd-core`, in a process of its own that runs this module (`blender.converted`).
 
 Layers are looked at before anything is composed of them: all that they name has to be a layer in the folder of the
 first one or below. What glTF as we read it has no place for is named in `asset.extras` of the file.
@@ -28,11 +28,11 @@ from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS, check_decodable
 from advsearch.scene.assets import face_vectors
-from advsearch.scene.glb_buffer import GlbBuffer, mime_type
+from advsearch.scene.glb import GlbBuffer, mime_type
+from advsearch.scene.importing.blender import GENERATOR, LAYERS, PACKAGE
 from advsearch.scene.importing.files import LARGEST_FILE, check_faces, check_most
+from advsearch.scene.importing.geometry import triangulated
 from advsearch.scene.importing.gltf import DEEPEST_TREE, LARGEST_TREE
-from advsearch.scene.importing.polygons import triangulated
-from advsearch.scene.importing.usd import GENERATOR, LAYERS, PACKAGE
 
 FIRST = Usd.TimeCode.EarliestTime()
 MOST_LAYERS = 1000

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Doubles, Ints, face_vectors
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing import udim
+from advsearch.scene.importing import mtl_surfaces
 from advsearch.scene.importing.files import (
     MOST_CORNERS,
     Notes,
@@ -31,10 +31,9 @@ from advsearch.scene.importing.files import (
     shown,
     text_of,
 )
-from advsearch.scene.importing.mtl import without_comment
-from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of
+from advsearch.scene.importing.geometry import cut_up
+from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of, without_comment
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, alike, split_at_corners
-from advsearch.scene.importing.polygons import cut_up
 
 GROUPING = frozenset(("g", "o"))  # statements that only name parts; all parts are joined
 FREE_FORM = frozenset(
@@ -84,7 +83,7 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     square, inside = np.zeros(len(mapped), np.int64), (mapped >= 0).all(axis=1)  # of UDIM; 0: one picture for all
     for number in np.unique(material[inside & (material >= 0)]):
         mine = np.flatnonzero(inside & (material == number))
-        squares = udim.squares(tables["vt"][mapped[mine]])
+        squares = mtl_surfaces.squares(tables["vt"][mapped[mine]])
         several = reader.squares_of(names[number], np.unique(squares).tolist())
         square[mine] = np.where(np.isin(squares, several), squares, 0)
     for chosen in alike(material, inside, off, square):
@@ -103,7 +102,7 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         surface, tint = _tinted(notes, painted.surface, tint)
         uvs = Looked(tables["vt"], mapped).at(chosen)
         if uvs is not None:
-            uvs = replace(uvs, values=(uvs.values - udim.corner_of(number)) * painted.scale + painted.offset)
+            uvs = replace(uvs, values=(uvs.values - mtl_surfaces.corner_of(number)) * painted.scale + painted.offset)
             used = uvs.values[uvs.index[(uvs.index >= 0).all(axis=1)]]
             if painted.clamped and len(used) and not (used.min() >= -BEYOND and used.max() <= 1.0 + BEYOND):
                 notes.say(" has textures that are not to repeat beyond their edges (-clamp); here they do")

@@ -33,7 +33,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.scene.mitsuba_backend.material_edges import outline_terms, shadow_terms
 from advsearch.scene.mitsuba_backend.material_view import (
     _OUTLINES,
     _SHADOWS,
@@ -43,7 +42,9 @@ from advsearch.scene.mitsuba_backend.material_view import (
     gradient_of,
     is_rough,
     moving_mesh,
+    outline_terms,
     read_camera,
+    shadow_terms,
     shared_sampler,
     still_meshes,
     stream_of,

@@ -251,3 +251,223 @@ def is_rough(cotangent: Tensor) -> bool:
     values = cotangent.detach().to(torch.float64)
     right, down = (torch.diff(values, dim=dim).square().mean() for dim in (1, 0))
     return bool(right + down > 4.0 * (1.0 - ROUGH_COTANGENT) * values.square().mean())
+
+
+# ---- Boundary terms of the material form: outlines and shadows, by sampled edges (see `adjoint`) --------------------
+
+EDGE_OFFSET = 0.01
+"""How far beside an outline we look for what is behind it, in pixels."""
+DEPTH_TOLERANCE = 1e-3
+"""Something hides an edge if it is nearer than this fraction of the distance."""
+SHADOW_OFFSET = 1e-4
+"""How far beside an edge a shadow ray passes, in extents of the mesh."""
+GRAZING = 0.02
+"""Smallest cosine at a lit point that is divided by."""
+NEAREST = 1e-3
+"""Smallest depth of an edge that is used, in world units; there is no clipping of edges."""
+
+
+# ---- outlines -------------------------------------------------------------------------------------------------------
+
+
+def outline_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
+    """A number whose gradient is the outline term's, for the edges of one mesh."""
+    sampled = _sampled_outline(view.camera, mesh, uniform_numbers(stream, spp * view.camera.pixels, 1)[:, 0])
+    if sampled is None:
+        return mi.Float(0)
+    ends, part, normal, share = sampled
+    n = mi.Vector2f(as_numbers(normal[:, 0]), as_numbers(normal[:, 1]))
+    edge = mesh.point(ends, part)
+    film = view.camera.project(edge)
+    with dr.suspend_grad():
+        ray = view.camera.ray(dr.detach(film) + EDGE_OFFSET * n)
+        hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
+        reach = dr.norm(dr.detach(edge) - view.camera.eye) * (1.0 - DEPTH_TOLERANCE)
+        visible = ~hit.is_valid() | (hit.t > reach)
+        behind = view.radiance(ray, own_sampler(stream + _PATHS, len(part)), view.max_depth, visible)
+        strength = dr.sum(view.weight(film, visible) * behind)
+        strength = dr.select(visible & dr.isfinite(strength), strength, 0.0)
+        dr.eval(strength, hit)
+    place, _, _, moves = view.follow(hit)
+    speed = dr.dot(n, film - dr.select(moves, view.camera.project(place), 0.0))
+    return dr.sum(strength * speed) * -share
+
+
+def _sampled_outline(camera: Camera, mesh: TriMesh, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor, float] | None:
+    """Sample the outline evenly by its length on the film, hidden parts included, by numbers (n,) in [0, 1).
+
+    Returns:
+        None if nothing is in the picture; else (n, 2) vertices of the edge, (n,) part of the way along it in space, (n,
+        2) unit normal on the film away from the mesh, and the length in pixels for each sample.
+    """
+    eye, forward = from_vector(camera.eye), from_vector(camera.forward)
+    ends, away = _silhouette(mesh.places, mesh.corners, eye)
+    if len(ends) == 0 or len(numbers) == 0:
+        return None
+    a, b = film_places(camera, mesh.places[ends[:, 0]]), film_places(camera, mesh.places[ends[:, 1]])
+    depth = (mesh.places[ends] - eye) @ forward
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+    on_film = (torch.maximum(a, b) > -0.5) & (torch.minimum(a, b) < size + 0.5)
+    length = torch.where((depth > NEAREST).all(dim=1) & on_film.all(dim=1), (b - a).norm(dim=1), 0.0)
+    if not float(length.sum()) > 0.0:
+        return None
+    pick, part = _along(length, numbers)
+    along = b[pick] - a[pick]
+    normal = torch.nn.functional.normalize(torch.stack([along[:, 1], -along[:, 0]], dim=1), dim=1)
+    middle = mesh.places[ends].mean(dim=1)
+    step = film_places(camera, middle + 1e-3 * mesh.extent * away) - film_places(camera, middle)
+    normal = normal * torch.where((normal * step[pick]).sum(dim=1, keepdim=True) < 0.0, -1.0, 1.0)
+    z = depth[pick]
+    part = part * z[:, 0] / (part * z[:, 0] + (1.0 - part) * z[:, 1])  # halfway on the film is not halfway in space
+    return ends[pick], part, normal, float(length.sum()) / len(numbers)
+
+
+def _along(length: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor]:
+    """Spread n stratified samples over segments of given lengths: (n,) which segment, (n,) which part of it."""
+    sums = length.cumsum(dim=0)
+    at = (torch.arange(len(numbers)) + numbers) / len(numbers) * sums[-1]
+    pick = torch.searchsorted(sums, at, right=True).clamp_max(int(length.nonzero().max()))
+    return pick, (1.0 - (sums[pick] - at) / length[pick]).clamp(0.0, 1.0)
+
+
+def _edges(places: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Edges of a mesh, vertices at the same place counting as one: (E, 2) vertices of each; for each of the 3 F sides
+    of faces, (3 F,) which edge it is and (3 F,) the vertex across."""
+    same = torch.unique(places, dim=0, return_inverse=True)[1]
+    sides = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    across = torch.cat([corners[:, 2], corners[:, 0], corners[:, 1]])
+    low, high = same[sides].aminmax(dim=1)
+    keys, owner = torch.unique(low * len(places) + high, return_inverse=True)
+    number = torch.arange(len(owner))
+    first = torch.full((len(keys),), len(owner)).scatter_reduce(0, owner, number, "amin")  # repeatable, unlike indexing
+    return sides[first], owner, across
+
+
+def _silhouette(places: Tensor, corners: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
+    """Edges all of whose faces lie on one side of the plane through the edge and the eye: (n, 2) vertices of each, and
+    (n, 3) the unit normal of that plane, away from the faces."""
+    ends, owner, across = _edges(places, corners)
+    plane = torch.linalg.cross(places[ends[:, 0]] - eye, places[ends[:, 1]] - eye)
+    plane = torch.nn.functional.normalize(plane, dim=1)
+    side = (plane[owner] * (places[across] - eye)).sum(dim=1)
+    lowest = torch.full((len(ends),), torch.inf, dtype=side.dtype).scatter_reduce(0, owner, side, "amin")
+    highest = torch.full((len(ends),), -torch.inf, dtype=side.dtype).scatter_reduce(0, owner, side, "amax")
+    on = (lowest > 0.0) | (highest < 0.0)
+    return ends[on], plane[on] * torch.where(lowest[on] > 0.0, -1.0, 1.0)[:, None]
+
+
+# ---- shadows --------------------------------------------------------------------------------------------------------
+
+
+def shadow_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
+    """A number whose gradient is the shadow term's, for the edges of one mesh."""
+    sampled = _sampled_tangents(mesh, uniform_numbers(stream, spp * view.camera.pixels, 4))
+    if sampled is None:
+        return mi.Float(0)
+    ends, part, direction, normal, share = sampled
+    p = as_vectors(mi.Point3f, torch.lerp(mesh.places[ends[:, 0]], mesh.places[ends[:, 1]], part[:, None]))
+    d, n = as_vectors(mi.Vector3f, direction), as_vectors(mi.Vector3f, normal)
+    beside = SHADOW_OFFSET * mesh.extent * n
+    with dr.suspend_grad():
+        ray = mi.Ray3f(p + beside, -d)
+        hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All, hit.is_valid())
+        lit = _lit_value(view, si, d)
+        dr.eval(lit, hit, si, p, beside)
+        kept = dr.compress(dr.any(lit != 0.0))
+        if dr.width(kept) == 0:
+            return mi.Float(0)
+        lit, hit, si, p, beside, n = (dr.gather(type(value), value, kept) for value in (lit, hit, si, p, beside, n))
+        strength = dr.sum(lit * _past_minus_hit(view, si, p, beside, stream))
+        strength = dr.select(dr.isfinite(strength), strength, 0.0)
+        dr.eval(strength, hit)
+    chosen = kept.torch().to("cpu", torch.int64)
+    place, _, _, moves = view.follow(hit)
+    sine = torch.linalg.cross(direction, _unit_edges(mesh.places, ends)).norm(dim=1)
+    speed = dr.dot(n, mesh.point(ends[chosen], part[chosen]) - dr.select(moves, place, 0.0))
+    return dr.sum(strength * as_numbers(sine[chosen]) * speed) * -share
+
+
+def _lit_value(view: FilmView, si: Any, d: Any) -> Any:
+    """W f J' of lit points that the camera sees, for light from d; elsewhere 0."""
+    camera = view.camera
+    film, depth, to_eye = camera.project(si.p), camera.depth(si.p), camera.eye - si.p
+    active = si.is_valid() & (depth > NEAREST) & camera.shows(film)
+    si.wi = si.to_local(dr.normalize(to_eye))
+    value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(d), active)
+    active &= dr.any(value > 0.0)
+    active &= ~view.scene.ray_test(si.spawn_ray_to(camera.eye), active)
+    scale = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * camera.focal_area
+    value *= scale / dr.maximum(dr.abs(dr.dot(si.n, d)), GRAZING)
+    return dr.select(active, value * view.weight(film, active), 0.0)
+
+
+def _past_minus_hit(view: FilmView, si: Any, p: Any, beside: Any, stream: int) -> Any:
+    """Difference of the radiance that arrives at a lit point just past an edge and just inside it."""
+
+    def towards(target: Any) -> Any:
+        ray = si.spawn_ray_to(target)
+        return mi.Ray3f(ray.o, ray.d)
+
+    first = view.scene.ray_intersect_preliminary(towards(p + beside), coherent=False)
+    reach = dr.norm(p - si.p) * (1.0 - DEPTH_TOLERANCE) - 2.0 * dr.norm(beside)
+    free = ~first.is_valid() | (first.t > reach)
+
+    def radiance(target: Any) -> Any:
+        sampler = own_sampler(stream + _PATHS, dr.width(p))
+        return view.radiance(towards(target), sampler, view.max_depth - 1, free)
+
+    return dr.select(free, radiance(p + beside) - radiance(p - beside), 0.0)
+
+
+def _sampled_tangents(mesh: TriMesh, numbers: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, float] | None:
+    """Sample points on edges and lines through them that touch the mesh there, evenly, by numbers (n, 4) in [0, 1).
+
+    The lines through a point of an edge that have both faces on one side fill the exterior angle of the edge, to
+    either side. An edge with one face lets every line pass.
+
+    Returns:
+        None if there is nothing to sample; else (n, 2) vertices of the edge, (n,) part of the way along it, (n, 3) unit
+        direction of the line, (n, 3) unit normal of edge and line away from the mesh, and the measure (world units
+        times steradians) for each sample.
+    """
+    ends, first, second, single = _folds(mesh.places, mesh.corners)
+    cosine = (first * second).sum(dim=1, keepdim=True)
+    rest = first - cosine * second
+    axis = _unit_edges(mesh.places, ends)
+    turned = torch.where(single[:, None], torch.linalg.cross(axis, second), -torch.nn.functional.normalize(rest, dim=1))
+    angle = torch.pi - torch.atan2(rest.norm(dim=1), cosine[:, 0])
+    measure = (mesh.places[ends[:, 1]] - mesh.places[ends[:, 0]]).norm(dim=1) * angle
+    if len(numbers) == 0 or not float(measure.sum()) > 0.0:
+        return None
+    pick, _ = _along(measure, numbers[:, 0])
+    ends, first, second, turned, axis = (tensor[pick] for tensor in (ends, first, second, turned, axis))
+    turn = numbers[:, 2:3] * angle[pick][:, None]
+    across = torch.cos(turn) * second + torch.sin(turn) * turned
+    height = 4.0 * numbers[:, 3:4] - 2.0  # the sign chooses the side, the rest is the cosine with the edge
+    across, height = torch.where(height < 0.0, -across, across), height.abs() - 1.0
+    direction = height * axis + (1.0 - height.square()).clamp_min(0.0).sqrt() * across
+    normal = torch.linalg.cross(axis, across)
+    normal = normal * torch.where((normal * (first + second)).sum(dim=1, keepdim=True) > 0.0, -1.0, 1.0)
+    return ends, numbers[:, 1], direction, normal, 4.0 * float(measure.sum()) / len(numbers)
+
+
+def _folds(places: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Edges of one or two faces: (E, 2) vertices, (E, 3) unit vectors along one face and along the other, both
+    perpendicular to the edge, and (E,) whether there is only one face."""
+    ends, owner, across = _edges(places, corners)
+    order = torch.argsort(owner, stable=True)
+    number = torch.bincount(owner, minlength=len(ends))
+    last = number.cumsum(dim=0) - 1
+    proper = (number <= 2) & ((places[ends[:, 1]] - places[ends[:, 0]]).norm(dim=1) > 0.0)
+    ends, axis = ends[proper], _unit_edges(places, ends[proper])
+
+    def perpendicular(entry: Tensor) -> Tensor:
+        vector = places[across[order[entry[proper]]]] - places[ends[:, 0]]
+        return torch.nn.functional.normalize(vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1)
+
+    return ends, perpendicular(last - number + 1), perpendicular(last), number[proper] == 1
+
+
+def _unit_edges(places: Tensor, ends: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(places[ends[:, 1]] - places[ends[:, 0]], dim=1)

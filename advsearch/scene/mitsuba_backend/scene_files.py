@@ -21,8 +21,17 @@ from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSur
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene
 from advsearch.scene.importing.texture import textured
 from advsearch.scene.mitsuba_backend.meshes import plain, with_inner
-from advsearch.scene.mitsuba_backend.shape_surfaces import ShapeSurface, constant, surface_of
-from advsearch.scene.mitsuba_backend.shapes import MESHES, OF_A_SHAPE, ShapeMesh, haze_in, mesh_of, pose_of
+from advsearch.scene.mitsuba_backend.shapes import (
+    MESHES,
+    OF_A_SHAPE,
+    ShapeMesh,
+    ShapeSurface,
+    constant,
+    haze_in,
+    mesh_of,
+    pose_of,
+    surface_of,
+)
 from advsearch.scene.mitsuba_backend.variant import Plugin
 from advsearch.scene.mitsuba_backend.xml_files import read_scene, trusted
 from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in

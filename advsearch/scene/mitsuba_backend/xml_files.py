@@ -23,11 +23,11 @@ from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.files import note_opened
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.environments import SUFFIXES as RADIANCE
-from advsearch.scene.environments import import_environment, read_light
 from advsearch.scene.importing.files import References, damaged, looks_like, read_bytes, shown
 from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT, banded_average, read_picture
+from advsearch.scene.library import SUFFIXES as RADIANCE
+from advsearch.scene.library import import_environment, read_light
 from advsearch.scene.mitsuba_backend.meshes import with_inner
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, fewer_warnings, mi
 

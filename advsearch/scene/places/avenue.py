@@ -2,7 +2,7 @@
 
 The avenue is 300 m long and runs along x. The object stands at the origin, in the lane of those who drive towards +x.
 At both ends it meets another street, whose houses close the view; beyond them lies a plain to the horizon. What stands
-where is a `Place`; `crossing.py` and `car_park.py` are made of the same parts.
+where is a `StreetPlan`; `crossing.py` is made of the same parts.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 from advsearch.scene.assets import Doubles, Floats, Material
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.places import paint, road
+from advsearch.scene.places import paint
 from advsearch.scene.places.houses import Fronts
-from advsearch.scene.places.quads import FRONT, SHOWN, Quads, Wall
+from advsearch.scene.places.quads import DRY, FRONT, KERBS, ROAD, SHOWN, WET, Quads, Wall, shown
 
 END, CROSSING, FAR = 150.0, 12.0, 4000.0
 """Where the street ends, how wide the one is that it meets, and how far the plain goes."""
@@ -58,7 +58,7 @@ class Tree(NamedTuple):
     side: int = 0
 
 
-class Place(NamedTuple):
+class StreetPlan(NamedTuple):
     """What stands where.
 
     Attributes:
@@ -77,7 +77,7 @@ class Place(NamedTuple):
 
 @lru_cache(maxsize=4)
 def built(
-    plan: Place, metres: float, candelas: float | None, *, wet: bool, dark: bool, snow: bool = False
+    plan: StreetPlan, metres: float, candelas: float | None, *, wet: bool, dark: bool, snow: bool = False
 ) -> tuple[MeshPart, ...]:
     """Return the meshes of a place, with lengths in the metres of one object size.
 
@@ -87,7 +87,7 @@ def built(
         dark: whether lamps and windows shine.
         snow: whether snow lies on all that faces up; on the road it is driven on.
     """
-    rows, ground = _houses(plan.fronts), road.WET if wet else road.DRY
+    rows, ground = _houses(plan.fronts), WET if wet else DRY
     grey, white = np.full((2, 2, 3), 0.25, np.float32), np.full((2, 2, 3), 0.9, np.float32)
     tone = 1.0 + 0.25 * paint._clouds(128, 128, 32, 400) + 0.2 * paint._grain(128, 128, 401)
     grass = linear_to_srgb(np.clip(paint.tint((0.075, 0.095, 0.045)) * tone[..., None], 0.0, 1.0))
@@ -98,7 +98,7 @@ def built(
         quads.swept(fallen) if snow else quads for quads in (rows.walls, _trees(plan.trees), _posts(plan.posts))
     )
     made = (
-        (road.ROAD, plan.ground(), _display(paint.road, wet, snow), ground),
+        (ROAD, plan.ground(), _display(paint.road, wet, snow), ground),
         ("houses", walls, _display(paint.walls), WET_WALL if wet else WALL),
         ("windows", rows.dark, _display(paint.panes), PANE),
         ("lit-windows", rows.lit, _display(paint.panes), PANE),
@@ -121,7 +121,7 @@ def built(
 
 @lru_cache(maxsize=8)
 def _display(texture: Callable[..., Floats], *arguments: bool) -> Floats:
-    return road.shown(texture(*arguments))
+    return shown(texture(*arguments))
 
 
 @lru_cache(maxsize=2)
@@ -159,7 +159,7 @@ def asphalt(quads: Quads, x: tuple[float, float], y: tuple[float, float]) -> Non
 
 def painted(quads: Quads, x: tuple[float, float], y: tuple[float, float]) -> None:
     """Add a rectangle of white paint on a road: it shows the line along the kerb."""
-    line = _shown(road.KERBS[0] + 0.45 - 0.04, road.KERBS[0] + 0.45 + 0.04)
+    line = _shown(KERBS[0] + 0.45 - 0.04, KERBS[0] + 0.45 + 0.04)
     corners = np.array([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])])
     along = (corners - corners[:1]).sum(axis=-1) / paint.GROUND_PERIOD + x[0] + y[0]
     quads.level(x, y, 0.004, np.stack([along, line[[0, 0, 1, 1]]], axis=-1))
@@ -168,7 +168,7 @@ def painted(quads: Quads, x: tuple[float, float], y: tuple[float, float]) -> Non
 def street(quads: Quads, begin: float, end: float, *, marked: bool = True) -> None:
     """Add a road along x with its pavements and kerbs."""
     low, high = paint.FRONTS
-    right, left = road.KERBS
+    right, left = KERBS
     if marked:
         level(quads, (begin, end), (right, left), 0.0)
     else:
@@ -329,4 +329,4 @@ RIGHT, LEFT = (
     Wall((0.0, paint.FRONTS[0], KERB), (0.0, 1.0, 0.0)), Wall((0.0, paint.FRONTS[1], KERB), (0.0, -1.0, 0.0)),
 )  # fmt: skip
 """Walls on either side of a street along x; along the right one x falls."""
-AVENUE = Place(_ground, ((RIGHT, -END, END, 1), (LEFT, -END, END, 2), *ends()), trees_along(), posts_along())
+AVENUE = StreetPlan(_ground, ((RIGHT, -END, END, 1), (LEFT, -END, END, 2), *ends()), trees_along(), posts_along())

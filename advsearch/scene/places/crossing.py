@@ -12,16 +12,16 @@ import numpy as np
 from advsearch.scene.geometry import rotation
 from advsearch.scene.library import load_object
 from advsearch.scene.parts import MeshPart, mesh_part
-from advsearch.scene.places import avenue, paint, road
-from advsearch.scene.places.avenue import END, KERB, Place, Tree, asphalt, painted, street
+from advsearch.scene.places import avenue, paint
+from advsearch.scene.places.avenue import END, KERB, StreetPlan, Tree, asphalt, level, painted, street
 from advsearch.scene.places.houses import DEPTH
 from advsearch.scene.places.paint import BAY, FRONTS
-from advsearch.scene.places.quads import Quads, Wall
+from advsearch.scene.places.quads import FRONT, KERBS, TOP, Quads, Wall
 
 AHEAD = 14.0
 """x of the middle of the other street, which is as wide."""
-MIDDLE = sum(road.KERBS) / 2.0
-NEAR, FAR = AHEAD + MIDDLE - road.KERBS[1], AHEAD + MIDDLE - road.KERBS[0]
+MIDDLE = sum(KERBS) / 2.0
+NEAR, FAR = AHEAD + MIDDLE - KERBS[1], AHEAD + MIDDLE - KERBS[0]
 """x of its kerbs."""
 WEST, EAST = AHEAD + MIDDLE - FRONTS[1], AHEAD + MIDDLE - FRONTS[0]
 """x of its fronts."""
@@ -36,7 +36,7 @@ SIGN_LOW = 1.5
 
 def _ground() -> Quads:
     quads, side = Quads(), Quads()
-    (right, left), (low, high) = road.KERBS, FRONTS
+    (right, left), (low, high) = KERBS, FRONTS
     street(quads, -END, STOP[0] - 0.4)
     street(quads, STOP[0] - 0.4, NEAR, marked=False)
     street(quads, FAR, FAR + 5.0, marked=False)
@@ -109,7 +109,7 @@ def _clear(x: float) -> bool:
     return not WEST - 1.0 < x < EAST + 1.0
 
 
-CROSSING = Place(
+CROSSING = StreetPlan(
     _ground,
     _fronts(),
     (
@@ -118,4 +118,61 @@ CROSSING = Place(
     ),
     (*(post for post in avenue.posts_along() if _clear(post[0])), *avenue.posts_along((30.0, -1.0))),
     _sign,
+)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A car park: rows of bays along two lanes, with trees and lamps, and houses around it. Lengths are metres.
+#
+# The object stands in a bay at the origin, with its front towards a lane.
+
+DEEP, WIDE, BAYS = 5.0, 2.5, 17
+"""Of a bay, and how many are beside each other."""
+ROWS = (-18.5, -7.5, -2.5, 8.5, 13.5, 24.5)
+"""Where rows begin in x: two back to back, then a lane, and so on."""
+LINE = 0.1
+(BEGIN, CAR_PARK_END), HALF, WALK = (-20.0, 31.0), 24.0, 7.0
+"""From and to in x, half of what it is in y, and how wide the pavement around it is."""
+
+
+def _car_park_ground() -> Quads:
+    quads = Quads()
+    asphalt(quads, (BEGIN, CAR_PARK_END), (-HALF, HALF))
+    edges = WIDE * (np.arange(BAYS + 1) - BAYS / 2.0)
+    for x in ROWS:
+        for y in edges:
+            painted(quads, (x, x + DEEP), (y - LINE / 2.0, y + LINE / 2.0))
+    for x in (-2.5, 13.5):  # between rows that stand back to back
+        painted(quads, (x - LINE / 2.0, x + LINE / 2.0), (edges[0], edges[-1]))
+    for ends in ((BEGIN - WALK, BEGIN), (CAR_PARK_END, CAR_PARK_END + WALK)):
+        level(quads, ends, (-HALF - WALK, HALF + WALK), KERB, (-9.9, -9.9 + WALK))
+    for sign in (-1.0, 1.0):
+        level(quads, (BEGIN, CAR_PARK_END), (sign * HALF, sign * (HALF + WALK)), KERB, (-9.9, -9.9 + WALK))
+    around = [(BEGIN, HALF, CAR_PARK_END - BEGIN, (0.0, -1.0)), (CAR_PARK_END, -HALF, CAR_PARK_END - BEGIN, (0.0, 1.0))]
+    around += [(BEGIN, -HALF, 2.0 * HALF, (1.0, 0.0)), (CAR_PARK_END, HALF, 2.0 * HALF, (-1.0, 0.0))]
+    for x, y, long, (out_x, out_y) in around:  # kerbs
+        frame = Wall((x, y, 0.0), (out_x, out_y, 0.0))
+        shown = np.array([[0.0, long / 24.0, 0.345, 0.348]])
+        quads.boxes(frame, np.array([[0.0, long, 0.0, 0.16, 0.0, KERB]]), shown, (FRONT, TOP))
+    return quads
+
+
+CAR_PARK_MIDDLE, OUT = (BEGIN + CAR_PARK_END) / 2.0, HALF + WALK
+CAR_PARK = StreetPlan(
+    _car_park_ground,
+    (
+        (Wall((CAR_PARK_MIDDLE, OUT, KERB), (0.0, -1.0, 0.0)), -40.0, 40.0, 21),
+        (Wall((CAR_PARK_MIDDLE, -OUT, KERB), (0.0, 1.0, 0.0)), -40.0, 40.0, 22),
+        (Wall((BEGIN - WALK, 0.0, KERB), (1.0, 0.0, 0.0)), -40.0, 40.0, 23),
+        (Wall((CAR_PARK_END + WALK, 0.0, KERB), (-1.0, 0.0, 0.0)), -40.0, 40.0, 24),
+    ),
+    tuple(
+        Tree(x, sign * (HALF + 1.8), number, side)
+        for side, sign in enumerate((-1.0, 1.0))
+        for number, x in enumerate((-16.0, -8.5, 9.0, 17.0, 24.0))
+    ),
+    (
+        *((x, y, y + arm) for x in (-2.5, 13.5) for y, arm in ((-WIDE * 5.5, -1.7), (WIDE * 5.5, 1.7))),
+        *((-13.0, sign * (HALF + 0.6), sign * (HALF - 1.1)) for sign in (-1.0, 1.0)),
+    ),
 )

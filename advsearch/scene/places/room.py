@@ -14,8 +14,7 @@ import numpy as np
 from advsearch.scene.assets import Doubles, Floats, Material
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.places.paint import _clouds, _grain, tint
-from advsearch.scene.places.quads import FRONT, SHOWN, Quads, Wall
-from advsearch.scene.places.road import FLOOR, shown
+from advsearch.scene.places.quads import FLOOR, FRONT, SHOWN, Quads, Wall, shown
 
 LOW, HIGH = (-1.75, -2.0, -0.75), (2.6, 1.9, 1.85)
 """Corners of the room."""

@@ -26,8 +26,7 @@ from torch import Tensor
 import advsearch
 from advsearch.cli.main import main
 from advsearch.cluster import InProcess
-from advsearch.engine.changes import CHANGED
-from advsearch.engine.problem import Problem
+from advsearch.engine.problem import CHANGED, Problem
 from advsearch.errors import AdvsearchError
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import attack_once
