@@ -53,10 +53,11 @@ class UnknownNameError(InputError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
         names = sorted(known)
-        near = [known for known in names if name.casefold() in ELSEWHERE.get(known, "").split()]
+        near = [candidate for candidate in names if name.casefold() in ELSEWHERE.get(candidate, "").split()]
         near = near or resembling(name, names)[:3]
         guess = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
-        super().__init__(f"unknown {kind} {name!r}.{guess} Known: {', '.join(names)}.{' ' + hint if hint else ''}")
+        listed, more = ", ".join(names) or "none", f" {hint}" if hint else ""
+        super().__init__(f"unknown {kind} {name!r}.{guess} Known: {listed}.{more}")
         self.near = tuple(near)
 
 

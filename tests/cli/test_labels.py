@@ -46,6 +46,7 @@ def test_whole_words_come_first_then_beginnings_then_parts_then_spelling(word: s
 def test_every_unknown_name_is_helped_in_the_same_way(name: str, near: str) -> None:
     error = UnknownNameError("name", name, ["step_size", "steps", "camera.azimuth", "mug"])
     assert error.near[0] == near and f"Did you mean {near!r}" in str(error)
+    assert str(UnknownNameError("run", name, [], "Give one.")) == f"unknown run {name!r}. Known: none. Give one."
 
 
 def test_a_name_of_any_length_is_compared_at_once() -> None:
