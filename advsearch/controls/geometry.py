@@ -28,7 +28,7 @@ from torch import Tensor
 
 from advsearch.controls.base import NOTHING, Choice, Control, Group, Parameter, Value, measure
 from advsearch.scene.assembly import MovingMesh
-from advsearch.scene.assets import Doubles, Ints, Mesh
+from advsearch.scene.assets import Doubles, Ints, Mesh, face_vectors
 from advsearch.scene.raster import welded
 
 CELL = 0.035
@@ -70,7 +70,7 @@ class Body:
         self.extent = float(np.ptp(self.places, axis=0).max())
         faces = self.index[mesh.faces]
         corners = self.places[faces]
-        turned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        turned = face_vectors(corners)
         self.faces = faces[np.linalg.norm(turned, axis=1) > 0.0]
         summed = np.zeros((count, 3))
         np.add.at(summed, faces.reshape(-1), np.repeat(turned, 3, axis=0))
@@ -143,7 +143,7 @@ def _signed(vectors: Doubles) -> Doubles:
 def _landmarks(solid: Body) -> tuple[Doubles, float]:
     """Points (N, 3) evenly spread over the surface, at most `LANDMARKS`, and the side of the cubes that hold one."""
     corners = solid.places[solid.faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    areas = np.linalg.norm(face_vectors(corners), axis=1)
     generator = np.random.default_rng(0)
     face = np.searchsorted(np.cumsum(areas) / areas.sum(), (np.arange(SAMPLES) + 0.5) / SAMPLES).clip(
         max=len(areas) - 1

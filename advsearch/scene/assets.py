@@ -170,7 +170,8 @@ class EnvironmentAsset:
 
 
 def face_vectors(corners: Doubles) -> Doubles:
-    """Return vectors (F, 3) along the normals of triangles (F, 3, 3), as long as twice their areas."""
+    """Return vectors (F, 3) along the sides from which triangles (F, 3, 3) are wound counter-clockwise, twice as
+    long as their areas."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 

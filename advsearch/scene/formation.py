@@ -19,12 +19,12 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Ints
+from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Ints, face_vectors
 from advsearch.scene.color import LOW_END, linear_to_srgb, srgb_to_linear
 from advsearch.scene.geometry import NEAREST, camera_to_world, object_to_world, standing
 from advsearch.scene.grounds import paved
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import doubled_normals, looked_up, pixels_in
+from advsearch.scene.raster import looked_up, pixels_in
 from advsearch.scene.settings import ORBIT_CAMERA, resolve
 from advsearch.scene.silhouettes import Frame
 
@@ -269,7 +269,7 @@ def _emitted(part: MeshPart, emission: Floats, place: Doubles) -> tuple[Doubles,
     A face is taken for a disk of its mean radiance.
     """
     corners = standing(part)[part.mesh.faces]
-    area = doubled_normals(corners) / 2.0
+    area = face_vectors(corners) / 2.0
     way = corners.mean(axis=1) - place
     far = (way * way).sum(axis=1)
     way = way / np.maximum(np.sqrt(far), 1e-12)[:, None]

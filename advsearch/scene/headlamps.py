@@ -25,10 +25,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Doubles, Floats, Ints, Material, Mesh
+from advsearch.scene.assets import Doubles, Floats, Ints, Material, Mesh, face_vectors
 from advsearch.scene.grounds import LUMINANCE
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart, ScenePart
-from advsearch.scene.raster import doubled_normals
 from advsearch.scene.settings import LAMPS
 from advsearch.scene.things import ThingPart, heights_over
 
@@ -161,7 +160,7 @@ def _glass(part: MeshPart, where: str, ahead: float, step: float, power: Doubles
         follows = cKDTree(mesh.vertices).query(vertices)[1]
         lies_on = cKDTree(mesh.vertices[mesh.faces].mean(axis=1)).query(vertices[faces].mean(axis=1))[1]
     corners = vertices[faces] / step
-    across = ahead * doubled_normals(corners)[:, 0] / 2.0
+    across = ahead * face_vectors(corners)[:, 0] / 2.0
     shape = vertices.astype(np.float32), faces.astype(np.uint32), normals.astype(np.float32), mesh.uvs[follows]
     radiance = 2.0 * power / max(float(across.clip(0.0).sum()), 1e-9)
     return LampGlass(

@@ -19,7 +19,7 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Bools, Doubles, Floats, Ints, Mesh
+from advsearch.scene.assets import Bools, Doubles, Floats, Ints, Mesh, face_vectors
 
 TOLERANCE = 1e-6
 """Barycentric weight by which a pixel's centre may miss a triangle, so that shared edges leave no gaps."""
@@ -92,12 +92,6 @@ def doubled_areas(corners: Doubles) -> Doubles:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def doubled_normals(corners: Doubles) -> Doubles:
-    """Return vectors (F, 3) along the sides from which triangles (F, 3, 3) are wound counter-clockwise, twice as long
-    as their areas."""
-    return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-
-
 def _ranges(low: Doubles, high: Doubles, size: int, miss: float) -> tuple[Ints, Ints]:
     """List the integers of [low, high] within [0, size - 1] for many intervals: each one's interval, and its value."""
     first = np.maximum(np.ceil(low - miss), 0.0).astype(np.int64)
@@ -165,7 +159,7 @@ class Charts:
     def areas(self) -> Floats:
         """Return the surface area (h, w) that each texel stands for, in squared mesh units; 0 where no chart is."""
         places = self.mesh.vertices[self.mesh.faces].astype(np.float64)
-        surface = np.linalg.norm(doubled_normals(places), axis=1)
+        surface = np.linalg.norm(face_vectors(places), axis=1)
         texels = np.abs(doubled_areas(_in_texels(self.mesh, self.covered.shape)))
         share = np.where(texels > 0.0, surface / np.maximum(texels, 1e-12), 0.0)
         return np.where(self.covered, share[self.face], 0.0).astype(np.float32)
@@ -319,5 +313,5 @@ def _in_texels(mesh: Mesh, shape: tuple[int, int]) -> Doubles:
 
 def _face_normals(mesh: Mesh) -> Doubles:
     """Unit normals (F, 3) of the flat faces; zero for a face without area."""
-    normals = doubled_normals(mesh.vertices[mesh.faces].astype(np.float64))
+    normals = face_vectors(mesh.vertices[mesh.faces].astype(np.float64))
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20))

@@ -1,4 +1,5 @@
-"""Several models at once, each with a task of its own: a prediction counts where it does for each of them."""
+"""Tasks made of others: several models at once, each with a task of its own; every thing in a picture; and the pictures
+of a rig of cameras."""
 
 from __future__ import annotations
 

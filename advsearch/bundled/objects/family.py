@@ -11,7 +11,7 @@ import numpy.typing as npt
 from advsearch.bundled.objects.draw import Draw
 from advsearch.bundled.objects.shapes import Array, Patch
 from advsearch.bundled.objects.textures import Paint, Texels
-from advsearch.scene.assets import Material, Mesh, MeshRig, ObjectAsset
+from advsearch.scene.assets import Material, Mesh, MeshRig, ObjectAsset, footing
 from advsearch.scene.library import BUNDLED_OBJECT, finished
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -115,9 +115,8 @@ def joined(patches: Sequence[Patch], places: Sequence[AtlasPlace], side: int = S
     """Return one mesh, largest extent 1, standing on z = 0 and centred, every number rounded to `DECIMALS`."""
     starts = np.cumsum([0] + [len(p.vertices) for p in patches[:-1]])
     vertices = np.concatenate([p.vertices for p in patches])
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
-    vertices = (vertices - origin) / float((high - low).max())
+    origin, extent = footing(vertices)
+    vertices = (vertices - origin) / extent
     normals = np.concatenate([p.normals for p in patches])
     uvs = np.concatenate([_in_atlas(place, p.uvs, side) for p, place in zip(patches, places, strict=True)])
     faces = np.concatenate([p.faces + start for p, start in zip(patches, starts, strict=True)])

@@ -9,7 +9,7 @@ from advsearch.bundled.objects.draw import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family
 from advsearch.bundled.objects.shapes import Array, Patch, Rest
 from advsearch.bundled.objects.textures import Texels, mix, noise, painter, step
-from advsearch.scene.assets import Ints, Material
+from advsearch.scene.assets import Ints, Material, face_vectors
 from advsearch.scene.people import Person, body_data
 
 FINISHES = {
@@ -56,9 +56,8 @@ def _patches(person: Person) -> list[Patch]:
 
 def _normals(vertices: Array, faces: Ints, index: Ints) -> Array:
     """Unit normals (V, 3), smooth across the seams of charts."""
-    a, b, c = vertices[faces].swapaxes(0, 1)
     summed = np.zeros((int(index.max()) + 1, 3))
-    np.add.at(summed, index[faces].reshape(-1), np.repeat(np.cross(b - a, c - a), 3, axis=0))
+    np.add.at(summed, index[faces].reshape(-1), np.repeat(face_vectors(vertices[faces]), 3, axis=0))
     normals = summed[index]
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 

@@ -16,6 +16,8 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from advsearch.scene.assets import face_vectors
+
 # ---- Plane and space curves from which the bundled objects are made. Float64; lengths in the object's units ---------
 
 Array: TypeAlias = npt.NDArray[np.float64]
@@ -189,8 +191,7 @@ def _grid_faces(points: Array) -> Indices:
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
     beside = corner[:, None] + [[0, 1, columns + 1, 0, columns + 1, columns]]
     faces = beside.reshape(-1, 3).astype(np.int64)
-    a, b, c = points.reshape(-1, 3)[faces].swapaxes(0, 1)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    area = np.linalg.norm(face_vectors(points.reshape(-1, 3)[faces]), axis=1)
     return np.asarray(faces[area > 1e-6 * float(np.median(area[area > 0.0]))])
 
 

@@ -12,11 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Doubles, Floats, Mesh
+from advsearch.scene.assets import Doubles, Floats, Mesh, face_vectors
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, MeshPart
-from advsearch.scene.raster import doubled_normals
 
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
@@ -84,7 +83,7 @@ def sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
     for part in parts:
         if part.emission is not None:
             corners = (part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T)[part.mesh.faces]
-            powers[part.name] = float(part.emission.mean() * np.linalg.norm(doubled_normals(corners), axis=1).sum())
+            powers[part.name] = float(part.emission.mean() * np.linalg.norm(face_vectors(corners), axis=1).sum())
     total = max(sum(powers.values()), 1e-30)  # of faces without area it is 0
     return {name: (1.0 - LEAST) * power / total + LEAST / len(powers) for name, power in powers.items()}
 

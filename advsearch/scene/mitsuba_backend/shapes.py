@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Doubles, Floats, Ints, Mesh
+from advsearch.scene.assets import Doubles, Floats, Ints, Mesh, face_vectors
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.mitsuba_backend.meshes import FACES, NORMALS, POSITIONS, TEXCOORDS, loadable, with_inner
 from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, mi
 from advsearch.scene.parts import BASE_COLOR, HazePart, plugins_in
-from advsearch.scene.raster import doubled_normals
 
 Buffers = tuple[Doubles, Ints, Doubles | None, Doubles | None, dict[str, Floats]]
 """Vertices, faces, normals and texture coordinates of a mesh, and its attributes, (V or F, n) by their names."""
@@ -63,14 +62,14 @@ def mesh_of(shape: Mapping[str, object], name: str) -> ShapeMesh:
         corners = faces.reshape(-1)
         attributes = _of(corners, attributes)
         vertices, faces = vertices[corners], np.arange(len(corners)).reshape(-1, 3)
-        faced = _unit(doubled_normals(vertices[faces])).repeat(3, axis=0)
+        faced = _unit(face_vectors(vertices[faces])).repeat(3, axis=0)
         normals = faced if flat or normals is None else normals[corners]
         uvs = np.tile(BARE, (len(faces), 1)) if uvs is None else uvs[corners]
     used, index = np.unique(faces, return_inverse=True)
     faces = index.reshape(-1, 3)
     vertices, uvs = vertices[used], uvs[used] * (1.0, -1.0) + (0.0, 1.0)
     normals = np.nan_to_num(normals)[used] * (-1.0 if shape.get("flip_normals") else 1.0)
-    if np.einsum("fk,fck->", doubled_normals(vertices[faces]), normals[faces]) < 0.0:
+    if np.einsum("fk,fck->", face_vectors(vertices[faces]), normals[faces]) < 0.0:
         faces = faces[:, ::-1]  # Mitsuba shades by the normals, whichever way faces are wound
     places, facing, texture = (values.astype(np.float32) for values in (vertices, normals, uvs))
     made = Mesh(places, np.ascontiguousarray(faces, np.uint32), facing, texture, _of(used, attributes))
@@ -134,7 +133,7 @@ def _solid(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
         uvs, faces = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
         vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
     normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1)) if normals is None else normals
-    faces = faces[np.linalg.norm(doubled_normals(vertices[faces]), axis=1) > 1e-9]
+    faces = faces[np.linalg.norm(face_vectors(vertices[faces]), axis=1) > 1e-9]
     matrix = pose_of(shape) @ local
     if not abs(np.linalg.det(matrix[:3, :3])) > 0.0:
         raise InputError(f"object {name}: expected a {kind} of some size, got one without extent; change its numbers")
