@@ -25,8 +25,7 @@ from advsearch.models import Model
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Facts, Mark, Prediction, Said, Task
 
-ASIDE = 0.1
-"""Cosine of the angle to the camera's axis from which on z-depth is no distance any more."""
+ASIDE = 0.1  # cosine of the angle to the camera's axis from which on z-depth is no distance any more
 DISPARITY, RELATIVE, METRIC = "relative disparity", "relative depth", "metric depth"
 
 KINDS = {
@@ -36,28 +35,20 @@ KINDS = {
 }
 """What a model's numbers may be."""
 
-AS_FAR, NEARER, FARTHER, GONE = (
-    "as far as it is",
-    "nearer than it is",
-    "farther than it is",
-    "as far as what is behind it",
-)
-OUT_OF_SHAPE = "out of shape"
-
+AS_FAR, OUT_OF_SHAPE = "as far as it is", "out of shape"
+NEARER, FARTHER, GONE = "nearer than it is", "farther than it is", "as far as what is behind it"
+LABELS = {"nearer": NEARER, "farther": FARTHER, "gone": GONE}
 GOALS = {
-    "nearer": "the object is judged nearer than it is",
-    "farther": "the object is judged farther than it is",
-    "gone": "the object is judged to be as far as what is behind it",
+    "nearer": f"the object is judged {NEARER}",
+    "farther": f"the object is judged {FARTHER}",
+    "gone": f"the object is judged to be {GONE}",
 }
 """What an attack may be after, by the name of the objective."""
-
-LABELS = {"nearer": NEARER, "farther": FARTHER, "gone": GONE}
 
 FEWEST, SPREAD = 16, 1.1
 """Pixels beside the object on which scale and shift are found, at least, and how many times as far as the nearest of
 them the farthest is."""
-LARGEST = 100.0
-"""The largest factor by which a pixel counts as too near or too far."""
+LARGEST = 100.0  # the largest factor by which a pixel counts as too near or too far
 
 Map = Mapping[str, Tensor]
 """What a model returns for one picture: (h, w), by one of `KINDS`, or by "" where it does not say."""
@@ -123,8 +114,6 @@ class Depth(Task):
         size: of the real object, its longest side in metres, for a model that predicts metres; the scene's own
             without it.
         seek: what an attack is after, one of `GOALS`; "" for any wrong distance.
-        seen_kind: what the network says; "" where it has not yet.
-        missing: what its user has to say before predictions can be judged; empty where nothing is missing.
 
     Raises:
         InputError: a value that is none of these.
@@ -138,8 +127,8 @@ class Depth(Task):
     kind: str = ""
     size: float = 0.0
     seek: str = ""
-    seen_kind: str = field(default="", metadata=FROM_RUN)
-    missing: str = field(default="", metadata=FROM_RUN)
+    seen_kind: str = field(default="", metadata=FROM_RUN)  # what the network says
+    missing: str = field(default="", metadata=FROM_RUN)  # what its user has to say before predictions can be judged
 
     def __post_init__(self) -> None:
         self.check_numbers(lambda value: 0.0 < value < LARGEST, "a number over 0, under 100", "tolerance")
@@ -151,11 +140,8 @@ class Depth(Task):
     # ---- what is read -----------------------------------------------------------------------------------------------
 
     def read(self, returned: Any, count: int) -> list[Map]:
-        """Return the map (h, w) of each picture in what a network returned, by what its numbers are.
-
-        Raises:
-            ValueError: there is none.
-        """
+        """Return the map (h, w) of each picture in what a network returned, by what its numbers are. Raises ValueError:
+        there is none."""
         kind = ""
         if isinstance(returned, Mapping):
             kind = next((one for one in KINDS if one in returned), "")
@@ -175,11 +161,8 @@ class Depth(Task):
         return [{kind: one} for one in returned.float()]
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Depth:
-        """See `Task.on`.
-
-        Raises:
-            InputError: the model was loaded for another task or with names of classes, or there is a target.
-        """
+        """See `Task.on`. Raises InputError: the model was loaded for another task or with names of classes, or there is
+        a target."""
         if model.read is None:
             raise InputError(f'model {model.name}: it was loaded for its logits; load it with task="depth"')
         if model.labels:
@@ -232,20 +215,13 @@ class Depth(Task):
         return (f"{text}, which are found by least squares on what is seen beside the object.",)
 
     def check(self, facts: Facts) -> None:
-        """See `Task.check`.
-
-        Raises:
-            InputError: there is a label.
-        """
+        """See `Task.check`. Raises InputError: there is a label."""
         if facts.label is not None:
             raise InputError("label: task depth has no classes; leave it out")
 
     def truth(self, facts: Facts) -> Distances:
-        """Return where the object is seen, and how far everything is.
-
-        Raises:
-            InputError: the lens sees so far aside that the distance along its axis says nothing.
-        """
+        """Return where the object is seen, and how far everything is. Raises InputError: the lens sees so far aside
+        that the distance along its axis says nothing."""
         if bool((facts.z_depth < ASIDE * facts.depth).any()):
             raise InputError(
                 "task depth: a model's depth is the distance along the camera's axis, and this lens sees things more "
@@ -272,8 +248,7 @@ class Depth(Task):
         far the share of the object's relief that is left lies under a half; see `_relief`.
         """
         if self.minimise or not self.seek:
-            loss = self.loss(output, truth)
-            return -loss if self.minimise else loss
+            return super().score(output, truth)
         if self.seek == "gone":
             return self._each(
                 output, truth, lambda f: torch.minimum(f.abs().mean() - self._bar, 0.5 - self._relief(f, truth))
@@ -343,29 +318,26 @@ class Depth(Task):
     def said(self, output: Sequence[Map], truth: Distances, margins: Sequence[float]) -> list[Said]:
         """See `Task.said`; the payload has the factor by which the distance is off, what is left of the relief, and
         where scale and shift were found."""
-        each = zip(output, margins, strict=True)
-        return [self._said(one, truth, right=margin >= 0.0) for one, margin in each]
-
-    def _said(self, one: Map, truth: Distances, *, right: bool) -> Said:
         if not truth.seen:
-            return Prediction(OUT_OF_VIEW), None
-        factors = self._factors(one, truth)
-        mean, relief = float(factors.mean()), float(self._relief(factors, truth))
-        if not math.isfinite(mean):
-            return Prediction(NOT_A_NUMBER), None
+            return [(Prediction(OUT_OF_VIEW), None)] * len(output)
+        found: list[Said] = []
         distance = float(truth.z[truth.mask].double().log().mean().exp())
-        payload: dict[str, JsonValue] = {
-            "distance": round(distance, 4),
-            "judged": round(distance * math.exp(mean), 4),
-            "factor": round(math.exp(float(factors.abs().mean())), 4),
-            "relief": round(relief, 4),
-        }
-        if (self.kind or next(iter(one))) != METRIC:
-            payload["fitted"] = "beside the object" if truth.anchored else "in the whole picture"
-        holds = {"nearer": -mean > self._bar, "farther": mean > self._bar, "gone": relief < 0.5}
-        names = sorted(("gone", "nearer", "farther"), key=lambda name: name != self.seek)
-        wrong = next((LABELS[name] for name in names if holds[name]), OUT_OF_SHAPE)
-        return Prediction(AS_FAR if right else wrong), payload
+        for one, margin in zip(output, margins, strict=True):
+            factors = self._factors(one, truth)
+            mean, relief = float(factors.mean()), float(self._relief(factors, truth))
+            payload: dict[str, JsonValue] = {
+                "distance": round(distance, 4),
+                "judged": round(distance * math.exp(mean), 4),
+                "factor": round(math.exp(float(factors.abs().mean())), 4),
+                "relief": round(relief, 4),
+            }
+            if (self.kind or next(iter(one))) != METRIC:
+                payload["fitted"] = "beside the object" if truth.anchored else "in the whole picture"
+            holds = {"nearer": -mean > self._bar, "farther": mean > self._bar, "gone": relief < 0.5}
+            names = sorted(("gone", "nearer", "farther"), key=lambda name: name != self.seek)
+            wrong = next((LABELS[name] for name in names if holds[name]), OUT_OF_SHAPE)
+            found.append((Prediction(AS_FAR if margin >= 0.0 else wrong), payload))
+        return found
 
     def marks(self, output: Sequence[Map], truth: Distances) -> list[list[Mark]]:
         """See `Task.marks`: the object, its pixels of which the distance is right, and the disparity of everything."""
