@@ -95,20 +95,22 @@ class Trial:
             worst = f"most wrong where it says {label}: {self._described(problem, query)}"
             picture = self._picture(asked.name, problem, query)
         reason = words.share_reason("right", verdict, right, sequence.count, sequence.interval, worst)
-        reason += f"; the object is not to be seen in {hidden} more, which are not counted" if hidden else ""
-        return self._decided(asked, verdict, reason, sequence, config, picture)
+        return self._decided(asked, verdict, reason + words.not_counted(hidden), sequence, config, picture)
 
     def _no_worse(self, asked: ClaimResult, claim: NoWorseClaim, config: SceneConfig) -> ClaimResult:
         problem, other = self._problem(config), self._problem(config.model_copy(update={"model": claim.than}))
         same = other.renderer.formation == problem.renderer.formation
         sequence, ours, theirs, verdict = ConfidenceSequence(self.confidence, sides=1), 0, 0, UNDECIDED
-        first = None
+        hidden, first = 0, None
         shared = self._shared(config).model_copy(update={"model": f"{config.model},{claim.than}"})
         with executor_for(shared, "advsearch.questions.test.claims:claim_worker", self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor, "0"))
             beside = Journal(self.run, Shared(other, executor, "1"))
             shown = (lambda _, picture: picture.clone()) if same else None
             for query, own, its in self._pairs(asked, claim, config, journal, beside, shown):
+                if own.said.prediction.label == OUT_OF_VIEW:
+                    hidden += 1
+                    continue
                 ours += own.said.right and not its.said.right
                 theirs += its.said.right and not own.said.right
                 if first is None and its.said.right and not own.said.right:
@@ -121,6 +123,7 @@ class Trial:
         counts = (sequence.count, ours, theirs)
         reason = words.difference_reason(verdict, counts, (2 * low - 1, 2 * high - 1), claim.than)
         picture = None if first is None else self._picture(asked.name, problem, first)
+        reason += words.not_counted(hidden)
         return self._decided(asked, verdict, reason, sequence, config, picture, (-1.0, 2.0))
 
     def _changes(self, asked: ClaimResult, claim: ChangeClaim, config: SceneConfig) -> ClaimResult:
@@ -129,7 +132,7 @@ class Trial:
         other = self._problem(config) if claim.when == AWAY else problem
         other.renderer.scene.assembly.away = claim.when == AWAY
         sequence, held, example, verdict = ConfidenceSequence(self.confidence, sides=1), 0, "", UNDECIDED
-        picture = None
+        hidden, picture = 0, None
         shared = self._shared(config)
         with executor_for(shared, "advsearch.questions.attack.carry_out:attack_worker", self.progress) as executor:
             journal, beside = Journal(self.run, Shared(problem, executor)), Journal(self.run, Shared(problem))
@@ -141,6 +144,9 @@ class Trial:
 
             for query, own, its in self._pairs(asked, claim, config, journal, beside, shown):
                 before, after = own.said.prediction, its.said.prediction
+                if before.label == OUT_OF_VIEW:
+                    hidden += 1
+                    continue
                 right = as_claimed(claim.claim, before, after)
                 held += right
                 if not right and picture is None:
@@ -151,7 +157,7 @@ class Trial:
                 if verdict != UNDECIDED:
                     break
         reason = words.share_reason("as claimed", verdict, held, sequence.count, sequence.interval, example)
-        return self._decided(asked, verdict, reason, sequence, config, picture)
+        return self._decided(asked, verdict, reason + words.not_counted(hidden), sequence, config, picture)
 
     def _pairs(
         self, asked: ClaimResult, claim: NoWorseClaim | ChangeClaim, config: SceneConfig, journal: Journal,

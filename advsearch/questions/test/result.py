@@ -168,6 +168,10 @@ def difference_reason(verdict: str, counts: tuple[int, int, int], interval: tupl
     return said + (f"; not decided after {count(pictures, 'picture')}" if verdict == UNDECIDED else "")
 
 
+def not_counted(hidden: int) -> str:
+    return f"; the object is not to be seen in {hidden} more, which are not counted" if hidden else ""
+
+
 def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, str]:
     """Return what a search says of a claim that there is nothing to find, and why."""
     verified, clean = summary.verified, summary.clean.control
