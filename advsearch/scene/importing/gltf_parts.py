@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import BaseModel
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Doubles, Floats, Ints, face_vectors
@@ -101,15 +100,10 @@ PLAIN = frozenset(("name", "weights", "extensions"))
 
 def _note_unread(header: Header, notes: Notes) -> None:
     """Note every key, extras of materials among them, and every attribute that is not read."""
-    level: list[object] = [header]
-    for entry in level:  # which grows
-        if isinstance(entry, list):
-            level.extend(inner for inner in entry if isinstance(inner, BaseModel))
-        elif isinstance(entry, BaseModel):
-            kind = WORDS.get(type(entry).__name__)
-            for key in (entry.model_extra or {}) if kind else ():
-                notes.has(str(kind), key)
-            level.extend(getattr(entry, name) for name in type(entry).model_fields)
+    for entry in header.entries():
+        kind = WORDS.get(type(entry).__name__)
+        for key in (entry.model_extra or {}) if kind else ():
+            notes.has(str(kind), key)
     for kind in set(WORDS.values()):
         for key in PLAIN if "material" in kind or "texture" in kind else {*PLAIN, "extras"}:  # notes of applications
             notes.take(kind, key)
