@@ -135,14 +135,12 @@ def help_text(setting: Setting) -> str:
 
 
 def _assignments(given: Sequence[str], flag: str) -> dict[str, object]:
-    """Return name to value from ``NAME=VALUE``, each name once."""
     pairs = [parse_assignment(text, flag) for text in given]
     check_once((name for name, _ in pairs), flag)
     return dict(pairs)
 
 
 def _choices(given: Sequence[str], flag: str) -> dict[str, object]:
-    """Return name to choice from ``NAME=CHOICE`` or a choice for all."""
     return _assignments([text if "=" in text else f"*={text}" for text in given], flag)
 
 

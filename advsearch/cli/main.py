@@ -164,7 +164,7 @@ GROUPS = {
         ("attack", "sweep", "gap", "region", "explain", "compare", "recipe", "harden"), ""
     ),
     "look: at scenes, names and predictions": {
-        "render": "show:render render a picture of a scene, and say what the model sees in it",
+        "render": "show:RENDER render a picture of a scene, and say what the model sees in it",
         "show": "show:show show what a run found, or the details of a control, a policy, a task or a recipe",
         "view": "dashboard:view write the page of a run again, or a folder that any web server can serve",
         "dashboard": "dashboard:dashboard show the pages of runs in a browser on this machine",
@@ -336,7 +336,6 @@ def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAct
 
 
 def _listing() -> str:
-    """Return the commands with what they do, group by group, as wide as the terminal."""
     column = 4 + max(map(len, COMMANDS))
     width = max(shutil.get_terminal_size().columns - 2, 2 * column)
     lines = []

@@ -171,8 +171,6 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
 
 
 def _check_tree(path: Path, header: Header) -> None:
-    """Check that the nodes form trees, as glTF demands, and neither too large nor too deep ones."""
-
     def triangles_of(primitive: Primitive) -> int:  # at most
         index = primitive.attributes.get("POSITION") if primitive.indices is None else primitive.indices
         count = 0 if index is None or primitive.mode < 4 else header.accessors[index].count

@@ -99,7 +99,6 @@ PLAIN = frozenset(("name", "weights", "extensions"))
 
 
 def _note_unread(header: Header, notes: Notes) -> None:
-    """Note every key, extras of materials among them, and every attribute that is not read."""
     for entry in header.entries():
         kind = WORDS.get(type(entry).__name__)
         for key in (entry.model_extra or {}) if kind else ():
@@ -119,10 +118,10 @@ def _note_unread(header: Header, notes: Notes) -> None:
 def beside(header: Header, file: str) -> list[str]:
     """Return what a file of that name, read as one object, leaves out of its scene: one sentence, or none."""
     lights, cameras = ([getattr(node, kind) is not None for node in header.nodes] for kind in ("lamp", "camera"))
-    what = _counts({"light{s}": lights, "camera{s}": cameras})
+    what = " and ".join(_counts({"light{s}": lights, "camera{s}": cameras}))
     left = f"{'is' if sum(lights + cameras) == 1 else 'are'} left out of the object"
     what_to_do = "name one node as the object, FILE#NODE, to keep the rest around it"
-    return [f"{file}: {' and '.join(what)} {left}; {what_to_do}"] if what else []
+    return [f"{file}: {what} {left}; {what_to_do}"] if what else []
 
 
 def lights_and_cameras(header: Header, file: str) -> list[str]:
@@ -138,13 +137,10 @@ def lights_and_cameras(header: Header, file: str) -> list[str]:
 
 
 def _counts(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
-    """Return how many there are of each kind, but for those of which there are none."""
-    return [counted(count, what) for what, those in kinds.items() if (count := sum(those))]
-
-
-def counted(count: int, what: str) -> str:
-    """Return a count of things, whose words have {s} or {es} where several have that."""
-    return f"{count} {what.format(s='' if count == 1 else 's', es='' if count == 1 else 'es')}"
+    """Return how many there are of each kind, but for those of which there are none; {s} and {es} are for several."""
+    counts = {what: sum(those) for what, those in kinds.items()}
+    ends = {True: {"s": "", "es": ""}, False: {"s": "s", "es": "es"}}
+    return [f"{count} {what.format(**ends[count == 1])}" for what, count in counts.items() if count]
 
 
 Fit = Callable[[Doubles], Doubles]
@@ -254,7 +250,6 @@ class GltfSurfaces:
     def _fitted(
         self, surface: ImportedSurface, material: MaterialEntry, uvs: Sequence[Doubles]
     ) -> tuple[ImportedSurface, Fit]:
-        """Give the pictures of a surface what lies beyond their edges, where they do not repeat there."""
         places = np.concatenate([*uvs, np.zeros((0, 2))])
         samplers = [self._sampler(use) for use in material.textures]
         if not surface.pictures or not len(places) or not np.isfinite(places).all():
@@ -304,12 +299,8 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Parse a glTF file; arguments, results and errors as for the others (`advsearch.scene.importing.objects`)."""
     file = GltfFile(path, data)
     header = file.header
-    drawn = [
-        (node, mesh, pose)
-        for node, pose in gltf_skeleton.poses(header)
-        if (mesh := header.nodes[node].mesh) is not None
-    ]
-    drawn.sort(key=lambda item: item[0])
+    poses = sorted(gltf_skeleton.poses(header), key=lambda item: item[0])
+    drawn = [(node, mesh, pose) for node, pose in poses if (mesh := header.nodes[node].mesh) is not None]
     moving = gltf_skeleton.check_moving(file, [node for node, _, _ in drawn])
     skinned = {mesh for node, mesh, _ in drawn if header.nodes[node].skin is not None}
     pieces = {
@@ -324,12 +315,10 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     left_out(header, notes)
     if len(with_faces) < len(pieces):
         notes.say(f"{len(pieces) - len(with_faces)} parts without faces (points, lines) are left out")
-    for words, meshes in (
-        (SEE_THROUGH, {mesh for (mesh, _), piece in with_faces.items() if piece.see_through}),
-        (DEFAULT, {mesh for (mesh, _), piece in with_faces.items() if piece.material is None}),
-    ):
-        if meshes:
-            notes.say(counted(len(meshes), words))
+    clear = {mesh for (mesh, _), piece in with_faces.items() if piece.see_through}
+    bare = {mesh for (mesh, _), piece in with_faces.items() if piece.material is None}
+    for sentence in _counts({SEE_THROUGH: [True] * len(clear), DEFAULT: [True] * len(bare)}):
+        notes.say(sentence)
     surfaces, finished = GltfSurfaces(file, notes), dict[tuple[int, int], ImportedPart]()
     groups = dict[int | None, dict[tuple[int, int], ImportedPart]]()
     for key, piece in with_faces.items():

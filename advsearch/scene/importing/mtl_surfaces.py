@@ -234,7 +234,6 @@ class MtlReader:
         return value if value >= 0.0 else None
 
     def _bumps(self, uses: dict[str, MapUse]) -> Floats | None:
-        """Return the normal map: ``norm``, or ``map_Bump`` or ``bump`` where these hold normals."""
         words = "the normal map {name} {why}; it is left out"
         for key, use in ((key, uses[key]) for key in NORMALS if key in uses):
             picture = self._picture(use, "numbers", words)
@@ -245,7 +244,6 @@ class MtlReader:
         return None
 
     def _glow(self, material: MtlMaterial, use: MapUse | None) -> Floats | None:
-        """Return the radiance that is said by ``Ke`` and ``map_Ke``; where there are both, their product."""
         values = numbers_of(material.numbers("ke") or "0")
         if values is None or len(values) not in (1, 3) or min(values) < 0:
             self.notes.say(f"the emission {shown(material.numbers('ke'))} is no colour; it is left out")

@@ -197,8 +197,6 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
 
 @dataclass
 class _Properties:
-    """Finds what is known among the properties of a file, and notes what is not."""
-
     path: Path
     elements: dict[str, Element]
     notes: Notes
@@ -330,7 +328,6 @@ class _Properties:
 
 
 def _whole(values: npt.NDArray[np.generic]) -> Ints:
-    """Return numbers as whole ones; -1 for what is none."""
     if values.dtype.kind == "f":
         values = np.where(np.abs(values.astype(np.float64)) < 2.0**53, values.astype(np.float64), -1.0)
     return values.astype(np.int64)

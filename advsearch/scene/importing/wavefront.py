@@ -295,7 +295,6 @@ class Lines:
         return np.frombuffer(bytes.fromhex(digits.decode()), np.uint8).reshape(-1, 4)[:, 1:].astype(np.float64)
 
     def _of(self, kind: str) -> tuple[Ints, Bytes]:
-        """Return the rows of a kind, and their bytes without keywords and comments."""
         mine, lengths = self.kind == KINDS.index(kind), self.ends - self.starts + 1
         rows = np.flatnonzero(mine)
         data = self.bytes[np.repeat(mine, lengths)]
