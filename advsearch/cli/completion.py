@@ -50,18 +50,16 @@ def completion(args: argparse.Namespace) -> int:
                 continue
             if named and flag not in OR_A_FILE:
                 action.choices = named
-            else:  # where shtab looks for it
-                action.complete = _names_or_files(flag, named) if named else shtab.FILE  # type: ignore[attr-defined]
+                continue
+            ways: dict[str, Any] = shtab.FILE
+            if named:  # or a file
+                function, words = f"_advsearch{flag.replace('-', '_')}", " ".join(named)
+                ways = {
+                    "preamble": {"bash": f'{function}() {{ compgen -W "{words}" -- "$1"; compgen -f -- "$1"; }}'},
+                    "bash": function,
+                    "zsh": f"_alternative 'names:name:({words})' 'files:file:_files'",
+                    "tcsh": "f",
+                }
+            action.complete = ways  # type: ignore[attr-defined]  # where shtab looks for it
     script = shtab.complete(parser, shell=args.shell)
     return output.say(args.json, {"command": "completion", "shell": args.shell, "script": script}, script)
-
-
-def _names_or_files(flag: str, names: list[str]) -> dict[str, Any]:
-    function = f"_advsearch{flag.replace('-', '_')}"
-    words = " ".join(names)
-    return {
-        "preamble": {"bash": f'{function}() {{ compgen -W "{words}" -- "$1"; compgen -f -- "$1"; }}'},
-        "bash": function,
-        "zsh": f"_alternative 'names:name:({words})' 'files:file:_files'",
-        "tcsh": "f",
-    }

@@ -317,10 +317,16 @@ def _parse(words: list[str], command: str | None) -> argparse.Namespace:
 
 def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAction[Any]]:
     """Return the parser, and what `add_command` adds the commands to."""
+    column = 4 + max(map(len, COMMANDS))
+    width = max(shutil.get_terminal_size().columns - 2, 2 * column)
+    lines = []
+    for title, commands in GROUPS.items():
+        texts = [f"  {name}".ljust(column) + help_of(name) for name in commands if name in COMMANDS]
+        lines += [title, *(textwrap.fill(text, width, subsequent_indent=" " * column) for text in texts), ""]
     parser = Parser(
         prog="advsearch",
         description="Find the scene that a vision model gets wrong most badly.",
-        epilog=f"{_listing()}\n{_EXAMPLES}",
+        epilog="\n".join([*lines, _EXAMPLES]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
@@ -333,16 +339,6 @@ def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAct
         parser_class=Parser,
     )
     return parser, subparsers
-
-
-def _listing() -> str:
-    column = 4 + max(map(len, COMMANDS))
-    width = max(shutil.get_terminal_size().columns - 2, 2 * column)
-    lines = []
-    for title, commands in GROUPS.items():
-        texts = [f"  {name}".ljust(column) + help_of(name) for name in commands if name in COMMANDS]
-        lines += [title, *(textwrap.fill(text, width, subsequent_indent=" " * column) for text in texts), ""]
-    return "\n".join(lines)
 
 
 def add_command(

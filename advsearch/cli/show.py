@@ -84,7 +84,16 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     if as_json:
         output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)
     else:
-        print(text(result) + output.go_on_text(result) + (_photos_text(photos) if photos else ""))
+        print(text(result) + output.go_on_text(result))
+    if photos and photos.interval is not None and not as_json:
+        agreeing, total = photos.right_right + photos.wrong_wrong, count(photos.photos, "photograph")
+        sure = f"95 % interval {interval_text(photos.interval)}"
+        lines = [
+            ["", "photograph right", "photograph wrong"],
+            ["rendering right", str(photos.right_right), str(photos.right_wrong)],
+            ["rendering wrong", str(photos.wrong_right), str(photos.wrong_wrong)],
+        ]
+        print(f"\nRenderings and reality agree in {agreeing} of {total}, {sure}:\n{output.aligned(lines)}")
     if picture:
         show_pictures(best_pictures(path))
     return 0
@@ -99,20 +108,6 @@ def photos_of(run: Path) -> PhotoAgreement | None:
     from advsearch.questions.photographs.carry_out import photo_agreement  # takes seconds
 
     return photo_agreement(run)
-
-
-def _photos_text(table: PhotoAgreement) -> str:
-    if table.interval is None:
-        return ""
-    lines = [
-        ["", "photograph right", "photograph wrong"],
-        ["rendering right", str(table.right_right), str(table.right_wrong)],
-        ["rendering wrong", str(table.wrong_right), str(table.wrong_wrong)],
-    ]
-    agreeing = table.right_right + table.wrong_wrong
-    total = count(table.photos, "photograph")
-    text = f"Renderings and reality agree in {agreeing} of {total}, 95 % interval {interval_text(table.interval)}:"
-    return f"\n\n{text}\n{output.aligned(lines)}"
 
 
 def _show_unfinished(run: Listed, as_json: bool) -> int:

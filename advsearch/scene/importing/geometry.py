@@ -79,7 +79,12 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
     if not 0.0 < size < np.inf:
         what = "all vertices coincide" if size == 0.0 else "its extent is too large to compute with"
         raise InputError(f"{source}: expected an object with a size, got a mesh in which {what}; export it again")
-    points, index = _welded((vertices - low) / size @ turn.T)
+    points, index = np.unique((vertices - low) / size @ turn.T + 0.0, axis=0, return_inverse=True)
+    index, pairs = index.reshape(-1), cKDTree(points).query_pairs(WELD, output_type="ndarray")
+    if len(pairs):
+        cluster = connected(len(points), pairs[:, 0], pairs[:, 1])
+        _, first, merged = np.unique(cluster, return_index=True, return_inverse=True)
+        points, index = points[first], merged[index].astype(np.int64)
     counts = [len(part.faces) for part in parts]
     return Soup(
         points=points,
@@ -249,16 +254,6 @@ def smooth_normals(soup: Soup) -> Doubles:
     smooth = unit_vectors(sums)[group].reshape(-1, 3, 3)
     sound = (smooth * unit[:, None]).sum(axis=2, keepdims=True) > 0.0  # NaN, where normals cancel, is not
     return np.where(sound, smooth, unit[:, None])
-
-
-def _welded(points: Doubles) -> tuple[Doubles, Ints]:
-    unique, index = np.unique(points + 0.0, axis=0, return_inverse=True)
-    pairs = cKDTree(unique).query_pairs(WELD, output_type="ndarray")
-    if not len(pairs):
-        return unique, index.reshape(-1)
-    cluster = connected(len(unique), pairs[:, 0], pairs[:, 1])
-    _, first, merged = np.unique(cluster, return_index=True, return_inverse=True)
-    return unique[first], merged[index.reshape(-1)].astype(np.int64)
 
 
 def _corners(values: Doubles | None, faces: Ints, width: int) -> Doubles:

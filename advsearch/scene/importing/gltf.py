@@ -221,14 +221,8 @@ class GltfFile:
     def view(self, index: int) -> memoryview:
         """Return the bytes of a view. Raises FileFormatError: they are not there."""
         view = self.header.bufferViews[index]
-        data, end = self._buffer(view.buffer), view.byteOffset + view.byteLength
-        if end > len(data):
-            raise damaged(self.path, f"a buffer of at least {end:,} bytes", f"{len(data):,}; the file is cut short")
-        return memoryview(data)[view.byteOffset : end]
-
-    def _buffer(self, number: int) -> bytes:
+        number, uri = view.buffer, self.header.buffers[view.buffer].uri
         if number not in self._read:
-            uri = self.header.buffers[number].uri
             try:
                 if uri is None and (number > 0 or self._chunk is None):
                     views = [view for view in self.header.bufferViews if view.buffer == number]
@@ -243,7 +237,10 @@ class GltfFile:
                 raise FileFormatError(message) from None
             except ValueError:
                 raise damaged(self.path, f"a buffer {number} in base64", "other text") from None
-        return self._read[number]
+        data, end = self._read[number], view.byteOffset + view.byteLength
+        if end > len(data):
+            raise damaged(self.path, f"a buffer of at least {end:,} bytes", f"{len(data):,}; the file is cut short")
+        return memoryview(data)[view.byteOffset : end]
 
     def values(self, index: int) -> npt.NDArray[Any]:
         """Return the values (count, width) of an accessor as they are stored, those that are sparse put in. Raises

@@ -5,7 +5,7 @@ What materials look like is said in glTF 2.0, section 3.9; how their textures go
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -143,8 +143,6 @@ def _counts(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
     return [f"{count} {what.format(**ends[count == 1])}" for what, count in counts.items() if count]
 
 
-Fit = Callable[[Doubles], Doubles]
-"""Takes texture coordinates (V, 2) of the format to those of the pictures that were made."""
 BEYOND = 1e-4  # how far texture coordinates may lie outside of a texture before it matters how that goes on
 SMALL = 256  # texels a side up to which half a texel at an edge is seen
 EDGES = " has textures that do not repeat beyond their edges; where they differ, or reach far, they do here"
@@ -161,10 +159,9 @@ class GltfSurfaces:
     def __post_init__(self) -> None:
         self._pictures = FilePictures(len(self.file.header.materials), self.file.references, self.notes)
 
-    def surface(self, number: int | None, parts: Sequence[ImportedPart]) -> tuple[ImportedSurface, Fit]:
-        """Return the surface of a material (None: the format's default), and how texture coordinates fit its pictures;
-        `parts` are all that have it, with the format's texture coordinates."""
-        uvs = [part.uvs for part in parts if part.uvs is not None]
+    def surface(self, number: int | None, parts: Sequence[ImportedPart]) -> tuple[ImportedSurface, Doubles, Doubles]:
+        """Return the surface of a material (None: the format's default), and by what texture coordinates are scaled,
+        (2,), and shifted then, (2,), to fit its pictures; `parts` are all that have it, with the format's."""
         material = MaterialEntry() if number is None else self.file.header.materials[number]
         entry = material.surface
         scaled = np.array([1.0] * 4 if entry.baseColorFactor is None else entry.baseColorFactor, np.float32).clip(0, 1)
@@ -184,13 +181,7 @@ class GltfSurfaces:
         if alpha:
             cutoff = None if material.alphaMode == "BLEND" else material.alphaCutoff
             kept, texture = with_opacity(kept, scaled[3:], cutoff), with_opacity(texture, scaled[3:], cutoff)
-        roughness, metallic = entry.roughnessFactor, entry.metallicFactor
-        words = "the texture {name} of roughness and metallic {why}; it is left out"
-        packed = self._picture(entry.metallicRoughnessTexture, "numbers", words)
-        if packed is not None:
-            self.notes.say("textures of roughness and metallic are replaced by their means")
-            _, green, blue = self._mean(packed, material, entry.metallicRoughnessTexture, parts).tolist()
-            roughness, metallic = roughness * green, metallic * blue
+        roughness, metallic = self._roughness_and_metallic(material, parts)
         normals = emission = None
         if material.normalTexture is not None and material.reads(material.normalTexture):
             normals = self._picture(material.normalTexture, "numbers", "the normal map {name} {why}; it is left out")
@@ -203,19 +194,24 @@ class GltfSurfaces:
                 emission = limited_radiance(glow, picture, self.notes)
         name = "" if number is None else material.name or f"material {number}"
         surface = ImportedSurface(kept, texture, unit(roughness), unit(metallic), normals, emission, name)
-        return self._fitted(surface, material, uvs)
+        return self._fitted(surface, material, [part.uvs for part in parts if part.uvs is not None])
 
-    def _mean(
-        self, packed: Floats, material: MaterialEntry, use: TextureUse | None, parts: Sequence[ImportedPart]
-    ) -> Floats:
-        """The mean (3,) of a picture over the faces that show it; over all of it where it has other coordinates than
-        those that are read."""
+    def _roughness_and_metallic(self, material: MaterialEntry, parts: Sequence[ImportedPart]) -> tuple[float, float]:
+        """The factors times the mean of their picture over the faces that show it; over all of it where it has other
+        coordinates than those that are read."""
+        entry, use = material.surface, material.surface.metallicRoughnessTexture
+        packed = self._picture(use, "numbers", "the texture {name} of roughness and metallic {why}; it is left out")
+        if packed is None or use is None:
+            return entry.roughnessFactor, entry.metallicFactor
+        self.notes.say("textures of roughness and metallic are replaced by their means")
         mapped = [(part, part.uvs) for part in parts if part.uvs is not None]
-        if use is None or not mapped or not use.looked_up_as(material.layout or TextureUse(index=0)):
-            return np.asarray(packed.mean(axis=(0, 1), dtype=np.float64), np.float32)
-        corners = np.concatenate([uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped])
-        sides = face_vectors(np.concatenate([part.vertices[part.faces] for part, _ in mapped]))
-        return mean_over(packed, corners, np.linalg.norm(sides, axis=1))
+        mean = np.asarray(packed.mean(axis=(0, 1), dtype=np.float64), np.float32)
+        if mapped and use.looked_up_as(material.layout or TextureUse(index=0)):
+            corners = np.concatenate([uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped])
+            sides = face_vectors(np.concatenate([part.vertices[part.faces] for part, _ in mapped]))
+            mean = mean_over(packed, corners, np.linalg.norm(sides, axis=1))
+        _, green, blue = mean.tolist()
+        return entry.roughnessFactor * green, entry.metallicFactor * blue
 
     def _picture(self, use: TextureUse | None, kind: Kind, words: str) -> Floats | None:
         """Return the values of a texture, each texel as often as its filter asks for; say why it cannot be had."""
@@ -249,13 +245,11 @@ class GltfSurfaces:
 
     def _fitted(
         self, surface: ImportedSurface, material: MaterialEntry, uvs: Sequence[Doubles]
-    ) -> tuple[ImportedSurface, Fit]:
-        places = np.concatenate([*uvs, np.zeros((0, 2))])
-        samplers = [self._sampler(use) for use in material.textures]
-        if not surface.pictures or not len(places) or not np.isfinite(places).all():
-            return surface, lambda given: given
-        scale, shift = np.ones(2), np.zeros(2)
-        pictures, changed = list(surface.pictures), False
+    ) -> tuple[ImportedSurface, Doubles, Doubles]:
+        places, scale, shift = np.concatenate([*uvs, np.zeros((0, 2))]), np.ones(2), np.zeros(2)
+        samplers, pictures = [self._sampler(use) for use in material.textures], list(surface.pictures)
+        if not pictures or not len(places) or not np.isfinite(places).all():
+            return surface, scale, shift
         for axis, wraps in enumerate(([use.wrapS for use in samplers], [use.wrapT for use in samplers])):
             low, high = float(places[:, axis].min()), float(places[:, axis].max())
             side = 1 - axis  # rows of pictures come first
@@ -269,7 +263,7 @@ class GltfSurfaces:
                 self.notes.say(EDGES)
             if wraps[0] == gltf_entries.MIRRORED and out:
                 pictures = [np.concatenate([picture, np.flip(picture, side)], axis=side) for picture in pictures]
-                scale[axis], changed = 0.5, True
+                scale[axis] = 0.5
             elif wraps[0] in (gltf_entries.CLAMPED, gltf_entries.MIRRORED) and (out or any(differ)):
                 unit_size = int(np.gcd.reduce(sizes))  # pads are whole texels of each
                 before, after = (max(0, int(np.ceil(beyond * unit_size))) + 1 for beyond in (-low, high - 1.0))
@@ -281,10 +275,8 @@ class GltfSurfaces:
                     step = size // unit_size
                     texels = np.clip(np.arange(-before * step, (unit_size + after) * step), 0, size - 1)
                     pictures[number] = np.take(pictures[number], texels, side)
-                scale[axis], shift[axis], changed = unit_size / total, before / total, True
-        if not changed:
-            return surface, lambda given: given
-        return surface.with_pictures(pictures), lambda given: given * scale + shift
+                scale[axis], shift[axis] = unit_size / total, before / total
+        return surface.with_pictures(pictures), scale, shift
 
 
 # --- primitives in their places --------------------------------------------------------------------------------------
@@ -324,9 +316,9 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     for key, piece in with_faces.items():
         groups.setdefault(piece.material, {})[key] = piece.part
     for material, group in groups.items():
-        surface, fit = surfaces.surface(material, list(group.values()))
+        surface, scale, shift = surfaces.surface(material, list(group.values()))
         for key, part in group.items():
-            uvs = None if part.uvs is None else fit(part.uvs) * [1.0, -1.0] + [0.0, 1.0]
+            uvs = None if part.uvs is None else (part.uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
             finished[key] = replace(part, surface=surface, uvs=uvs)
     everywhere = dict(gltf_skeleton.poses(header.model_copy(update={"scenes": []})))
     skins = {}

@@ -571,7 +571,12 @@ class Inputs:
             wraps.append(WRAPS.get(word, 10497))
         turned, reader = np.eye(3), self._st(texture)
         if reader is not None and reader.GetIdAttr().Get() == "UsdTransform2d":
-            turned, reader = _transform2d(reader), self._st(reader, "in")
+            inputs = (reader.GetInput(name) for name in ("scale", "rotation", "translation"))
+            scale, rotation, shift = (value.Get(FIRST) if value else None for value in inputs)
+            angle = math.radians(rotation or 0.0)  # counter-clockwise
+            turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+            turned[:2, :2], turned[:2, 2] = turn @ np.diag(scale or (1.0, 1.0)), shift or (0.0, 0.0)
+            reader = self._st(reader, "in")
         if reader is not None and reader.GetInput("varname"):
             self.uv_name = str(_produced(reader, "varname") or "st")
         known = self.conversion.transforms.setdefault(self.material, turned)
@@ -586,15 +591,6 @@ class Inputs:
 
 
 _TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
-
-
-def _transform2d(shader: Any) -> Array:
-    inputs = (shader.GetInput(name) for name in ("scale", "rotation", "translation"))
-    scale, rotation, shift = (value.Get(FIRST) if value else None for value in inputs)
-    angle, matrix = math.radians(rotation or 0.0), np.eye(3)
-    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    matrix[:2, :2], matrix[:2, 2] = turn @ np.diag(scale or (1.0, 1.0)), shift or (0.0, 0.0)
-    return matrix
 
 
 def _first(schema: Any, name: str) -> Any:

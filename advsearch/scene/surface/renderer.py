@@ -45,8 +45,7 @@ class Sketch:
     @classmethod
     def of(cls, padded: Tensor) -> Sketch:
         """Sketch a map (H, W + 2, 3)."""
-        flat = padded.reshape(-1, 3)
-        mean = flat.mean(dim=0)
+        flat, mean = padded.reshape(-1, 3), padded.reshape(-1, 3).mean(dim=0)
         return cls(mean, flat[:: max(1, len(flat) // TEXELS)] / mean.clamp_min(1e-12))
 
     def times(self, other: Sketch) -> Tensor | None:
@@ -67,6 +66,7 @@ class SurfaceRenderer(Predictor):
     """
 
     fixed: Light | None = None
+    lights = 0
 
     def __init__(self, traced: Renderer, u: Tensor, seed: int) -> None:
         super().__init__(traced)
@@ -120,10 +120,6 @@ class SurfaceRenderer(Predictor):
         if self.fixed is not None:  # of its own: the rest is shared
             return self.fixed.bytes
         return self.arrangement.bytes + sum(light.bytes for light in self.lights_kept.values())
-
-    @property
-    def lights(self) -> int:
-        return 0
 
     def light(self, inputs: Mapping[str, Tensor]) -> Light:
         """Make the light under the environment of scene inputs."""
