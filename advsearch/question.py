@@ -198,7 +198,7 @@ def question(
         place: settings that Python takes by position.
         about: the setting that names a run or a file which it is about.
         expected: where that is given without its flag, what stands for it in the help, and what an error says it is;
-            as further fields of `cli.main.Positional`, what the help adds, and whether there may be several.
+            perhaps what the help adds, and whether there may be several.
         brought: returns settings that the `run.yaml` of that run brings, by what was typed.
         called: ``module:function`` that Python calls, where more can be given there than settings.
         more: what its help says after what it does.

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
-from advsearch.cli.main import Positional, QuestionCommand
+from advsearch.cli.main import QuestionCommand
 from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 
@@ -60,4 +60,4 @@ def write_files(config: Config, result: SuiteResult) -> None:
         write_text(path, getattr(room, name)(result), durable=False)
 
 
-COMMAND = _Test("test", about="suite", place=Positional("SUITE", "a suite, a YAML file"), examples=EXAMPLES)
+COMMAND = _Test("test", about="suite", expected=("SUITE", "a suite, a YAML file"), examples=EXAMPLES)
