@@ -124,14 +124,12 @@ class ShownResult:
 
 
 def shown(result: Result) -> ShownResult:
-    """Return what a person is shown of the result of any question."""
     room = registry.room(result.command)
     made: ShownResult = room.shown(result) if room and room.shown else fields_shown(result)
     return made
 
 
 def remarks_of(result: Result, given: ShownResult) -> list[str]:
-    """Return what has to be known beside a result."""
     ending = getattr(result, "ending", "")
     unsaid = ending == INTERRUPTED and "nterrupted" not in given.said
     stopped = ["Not finished: these are the results so far."] if unsaid else []
@@ -140,7 +138,6 @@ def remarks_of(result: Result, given: ShownResult) -> list[str]:
 
 
 def subject_of(result: Result, given: ShownResult) -> list[str]:
-    """Return what a result is about: objects, controls, model."""
     named = [getattr(result, name, None) or () for name in ("object", "objects", "controls", "model")]
     return [*given.about] or [", ".join([names] if isinstance(names, str) else names) for names in named if names]
 
@@ -356,7 +353,7 @@ class InNotebook:
             axes: to draw on; None makes new ones.
         """
         axes = new_axes() if axes is None else axes
-        if part := drawn_part(_shown(self)):
+        for part in [part for part in _shown(self).sections if part.draw][:1]:
             part.draw(axes)  # type: ignore[misc]
         return axes
 
@@ -393,38 +390,33 @@ def result_html(given: ShownResult, pictures: Mapping[str, ArrayLike] | None = N
         figures.append(element("figure", *inside, style="display:inline-block"))
     figure = result_figure(given)
     chart = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
-    parts = [_part(part) for part in given.sections if part.only in ("", "notebook") and not part.empty]
+    parts = []
+    for part in given.sections:
+        if part.only in ("", "notebook") and not part.empty:
+            heads = (
+                element("thead", element("tr", *(element("th", cell) for cell in part.heads))) if part.heads else None
+            )
+            rows = (element("tr", *(element("td", cell) for cell in row)) for row in part.rows)
+            inside = [element("p", text) for text in part.text if text and part.draw is None]
+            inside += [element("table", heads, element("tbody", *rows))] if part.rows else []
+            title = element("p", element("b", part.title)) if part.title else None
+            folded = element("details", element("summary", part.title), *inside)
+            parts.append(folded if part.folded else element("div", title, *inside))
     return element("div", element("p", given.said), *figures, chart, *parts)
-
-
-def drawn_part(given: ShownResult) -> ResultPart | None:
-    """Return the first part of a result that is drawn."""
-    return next((part for part in given.sections if part.draw is not None), None)
 
 
 def result_figure(given: ShownResult) -> Figures:
     """Return the figure of a result as files; none where nothing of it is drawn."""
-    part = drawn_part(given)
-    if part is None or part.draw is None:
-        return {}
-    return figure_of(part.draw, part.size or (WIDTH, part.height / PIXELS))
+    for part in given.sections:
+        if part.draw is not None:
+            return figure_of(part.draw, part.size or (WIDTH, part.height / PIXELS))
+    return {}
 
 
 def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
-    """Return pictures (H, W, 3) sRGB in [0, 1] beside each other as a PNG."""
     arrays = [np.asarray(picture, dtype=np.float32) for picture in pictures]
     gap = np.ones((len(arrays[0]), GAP, 3), np.float32)
     return png_bytes(np.concatenate([part for array in arrays for part in (array, gap)][:-1], axis=1))
-
-
-def _part(part: ResultPart) -> Html:
-    head = element("thead", element("tr", *(element("th", cell) for cell in part.heads))) if part.heads else None
-    body = (element("tr", *(element("td", cell) for cell in row)) for row in part.rows)
-    texts = [element("p", text) for text in part.text if text and part.draw is None]
-    table = element("table", head, element("tbody", *body)) if part.rows else None
-    if part.folded:
-        return element("details", element("summary", part.title), *texts, table)
-    return element("div", element("p", element("b", part.title)) if part.title else None, *texts, table)
 
 
 def _picture(png: bytes, width: int, alt: str) -> Html:
@@ -465,14 +457,9 @@ def study_chart(draw: Callable[[Axes], object], words: str, width: int = WIDE, h
 
     (file,) = drawn(on_figure, (width / 72, height / 72), ("svg",), STYLE).values()
     return element(
-        "svg",
-        element("title", words),
-        _inline(file.decode("utf-8"), f"{width}-"),
-        viewBox=f"0 0 {width} {height}",
-        class_="chart wide" if width == WIDE else "chart narrow",
-        role="img",
-        aria_label=words,
-    )
+        "svg", element("title", words), _inline(file.decode("utf-8"), f"{width}-"), viewBox=f"0 0 {width} {height}",
+        class_="chart wide" if width == WIDE else "chart narrow", role="img", aria_label=words,
+    )  # fmt: skip
 
 
 def _inline(file: str, prefix: str) -> Html:

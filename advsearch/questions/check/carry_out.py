@@ -6,9 +6,8 @@ import math
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,11 +20,11 @@ from advsearch.engine import planning
 from advsearch.engine.gradients import FACTORS, Loss, attempts, derivatives, inside, smooth_loss
 from advsearch.engine.naming import settings_alone
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Results, kept_rows
-from advsearch.progress import NullProgress, Progress
+from advsearch.engine.record import Results, taken_rows
+from advsearch.progress import Progress
+from advsearch.question import Asked
 from advsearch.questions.attack.carry_out import LOADING, problem_from_config
 from advsearch.questions.check.result import CheckConfig, CheckedRow, CheckResult, GainRow, SearchPlan, TexelRow
-from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Measured, PathLength
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
@@ -46,40 +45,34 @@ Finding = CheckedRow | SearchPlan | PathLength | GainRow | TexelRow
 FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
 
 
-def check_from_config(
-    config: CheckConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> CheckResult:
-    """Do what a configuration describes, or go on with it, and keep it in a run directory. What is measured is stored
-    at once, so that a check that was stopped goes on where it was and ends with the same rows; only times differ."""
-    progress, begun = progress or NullProgress(), time.perf_counter()
-    progress.stage(LOADING)
-    parts = parts_of(config)
-    with RunDirectory.of(config, resumed) as run:
-        results, measured = Results(run, config.seconds), 0
+def checked(asked: Asked[CheckConfig]) -> CheckResult:
+    """Do what is asked, or go on with it. What is measured is stored at once, so that a check that was stopped goes on
+    where it was and ends with the same rows; only times differ."""
+    asked.progress.stage(LOADING)
+    parts, measured = parts_of(asked.config), 0
+    results, configs = Results(asked.run, asked.config.seconds), [part.config for part in parts]
 
-        def findings() -> Iterator[Finding]:
-            nonlocal measured
-            for part in parts:
-                yield from _findings_of(part, len(parts), results, progress)
-                measured += 1
+    def findings() -> Iterator[Finding]:
+        nonlocal measured
+        for part in parts:
+            yield from _findings_of(part, len(parts), results, asked.progress)
+            measured += 1
 
-        def result(taken: Sequence[Finding], ending: str) -> CheckResult:
-            configs = [part.config for part in parts]
+    def result(taken: list[Finding]) -> CheckResult:
+        def those(kind: type[Any]) -> list[Any]:
+            return [row for row in taken if isinstance(row, kind)]
 
-            def those(kind: type[Any]) -> list[Any]:
-                return [row for row in taken if isinstance(row, kind)]
+        return asked.result(
+            CheckResult,
+            object=",".join(dict.fromkeys(config.object for config in configs)),
+            environment=",".join(dict.fromkeys(config.lit_by for config in configs)),
+            controls=list(dict.fromkeys(name for config in configs for name in config.controls)),
+            measured=measured, planned=len(parts), rows=those(CheckedRow),
+            plan=next(iter(those(SearchPlan)), None), bounces=next(iter(those(PathLength)), None),
+            gains=those(GainRow), texels=those(TexelRow),
+        )  # fmt: skip
 
-            return CheckResult(
-                run=str(run.path), object=",".join(dict.fromkeys(config.object for config in configs)),
-                environment=",".join(dict.fromkeys(config.lit_by for config in configs)),
-                controls=list(dict.fromkeys(name for config in configs for name in config.controls)),
-                ending=ending, measured=measured, planned=len(parts), rows=those(CheckedRow),
-                plan=next(iter(those(SearchPlan)), None), bounces=next(iter(those(PathLength)), None),
-                gains=those(GainRow), texels=those(TexelRow), seconds={"total": time.perf_counter() - begun},
-                seed=config.seed, command_line=config.command_line(),
-            )  # fmt: skip
-
-        return kept_rows(run, results, findings(), result)
+    return taken_rows(asked, results, findings(), result)
 
 
 @dataclass(frozen=True)

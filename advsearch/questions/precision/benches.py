@@ -38,7 +38,6 @@ class TimeBudget:
         return max(0.0, self._end - self.clock())
 
     def share(self, part: float) -> TimeBudget:
-        """Return a budget of a part, in [0, 1], of what is left."""
         return TimeBudget(part * self.left, self.clock)
 
 
@@ -172,7 +171,6 @@ class PictureBench:
         ]
 
     def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> list[PrecisionReference]:
-        """Render the references, one for each family, in shares of a budget."""
         families, rows = list(dict.fromkeys(map(denoiser_of, self._lines))), []
         for number, family in enumerate(families):
             share = budget.share(1.0 / (len(families) - number))
@@ -242,7 +240,6 @@ class GradientPart:
         return sum(group.size for group in self.groups)
 
     def of(self, gradient: Tensor) -> Array:
-        """Return the part's entries (n,) of a whole gradient (d,)."""
         return flat(torch.cat([gradient[group.coordinates] for group in self.groups]))
 
 
@@ -288,9 +285,14 @@ class GradientBench:
         return settings
 
     def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> list[PrecisionReference]:
-        """Find the reference."""
         if self.part.size <= BY_COORDINATE:
-            along = [_coordinate(self._u, group, number) for group in self.part.groups for number in range(group.size)]
+            along = []
+            for group in self.part.groups:
+                for place in range(group.begin, group.begin + group.size):
+                    direction = torch.zeros_like(self._u)
+                    direction[place] = 1.0
+                    alone, name = replace(group, size=1, begin=place), f"{group.name}.{place - group.begin}"
+                    along.append(Probe(alone, name, direction, group.step))
 
             def both(noise: int, spp: int) -> Array:
                 """Of each coordinate the derivative, extrapolated to a step of zero, and how far two steps differ."""
@@ -340,12 +342,6 @@ class GradientBench:
 
     def _taken(self, renderer: Renderer, estimator: str, seed: int, spp: int) -> Tensor:
         return estimated(renderer, self._loss, self._u, estimator, self.part.names, seed, spp)
-
-
-def _coordinate(u: Tensor, group: Group, number: int) -> Probe:
-    direction = torch.zeros_like(u)
-    direction[group.begin + number] = 1.0
-    return Probe(replace(group, size=1, begin=group.begin + number), f"{group.name}.{number}", direction, group.step)
 
 
 def _row(quantity: str, name: str, value: ReferenceValue, spp: int, control: str = "") -> PrecisionReference:

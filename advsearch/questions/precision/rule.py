@@ -197,7 +197,6 @@ def levels_off(points: Sequence[PrecisionPoint]) -> bool:
 
 
 def exactly(point: PrecisionPoint, samples: float) -> int:
-    """Round a number of samples up, where every number will do."""
     return math.ceil(samples - 1e-9)
 
 

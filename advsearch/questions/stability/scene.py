@@ -41,14 +41,9 @@ Thing = str | Path | ObjectAsset | Callable[[], ObjectAsset]
 
 
 def small(
-    controls: ControlSettings,
-    thing: Thing = "mug",
-    *,
-    environment: str | Path | EnvironmentAsset | None = None,
-    settings: Mapping[str, float] | None = None,
-    parts: Sequence[ScenePart] = (),
-    denoise: str = "none",
-) -> Renderer:
+    controls: ControlSettings, thing: Thing = "mug", *, environment: str | Path | EnvironmentAsset | None = None,
+    settings: Mapping[str, float] | None = None, parts: Sequence[ScenePart] = (), denoise: str = "none",
+) -> Renderer:  # fmt: skip
     """Return `render(u, seed, spp)` of a small picture: as `Scene.renderer`, with parts of our own.
 
     Its differences are taken over a pixel: the losses of these cases are smooth.
@@ -74,7 +69,6 @@ def plain_environment() -> EnvironmentAsset:
 
 
 def grey_map(value: float, texel: float | None = None) -> EnvironmentAsset:
-    """Return a grey map (16, 32, 3), one texel of it different."""
     radiance: Floats = np.full((16, 32, 3), value, np.float32)
     if texel is not None:
         radiance[4, 10] = texel
@@ -99,13 +93,11 @@ def checked(mesh: Mesh) -> ObjectAsset:
 
 
 def painted(texels: np.ndarray) -> ObjectAsset:
-    """Return the mug with another texture (h, w) of greys, display-referred."""
     grey = np.repeat(texels[:, :, None], 3, axis=2).astype(np.float32)
     return replace(library.load_object("mug"), name="painted", base_color=grey)
 
 
 def black_and_white() -> ObjectAsset:
-    """Return the mug with 8 x 8 texels that are exactly 0 and 1."""
     return painted(np.indices((8, 8)).sum(axis=0) % 2)
 
 
@@ -120,22 +112,11 @@ Range = tuple[float | None, float | None]
 
 
 def seen(
-    controls: ControlSettings,
-    thing: Thing = "mug",
-    *,
-    u: Sequence[float] | Mapping[int, float] | None = None,
-    spp: int = SPP,
-    compare: bool = True,
-    seeds: tuple[int, int] = (3, 12),
-    repeats: int = 24,
-    evaluations: int = 3,
-    mean: Range | None = None,
-    gradient: Range | None = None,
-    ending: str = "",
-    beside: Mapping[str, object] | None = None,
-    apart: Range = (None, SAME_PICTURE),
-    **scene: object,
-) -> Outcome:
+    controls: ControlSettings, thing: Thing = "mug", *, u: Sequence[float] | Mapping[int, float] | None = None,
+    spp: int = SPP, compare: bool = True, seeds: tuple[int, int] = (3, 12), repeats: int = 24, evaluations: int = 3,
+    mean: Range | None = None, gradient: Range | None = None, ending: str = "",
+    beside: Mapping[str, object] | None = None, apart: Range = (None, SAME_PICTURE), **scene: object,
+) -> Outcome:  # fmt: skip
     """Render a scene, differentiate it, compare the gradient with differences, which costs most of the time, and search
     from there.
 
@@ -187,7 +168,6 @@ def seen(
 
 
 def shown(renderer: Renderer, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
-    """Return the picture (H, W, 3) of a configuration, without a graph."""
     with torch.no_grad():
         return renderer(u, seed, spp)
 
@@ -219,24 +199,16 @@ def inward(renderer: Renderer, slope: Tensor, of: Tensor | float, seeds: int, sp
     return float(slope @ direction), math.fsum(wanted) / seeds
 
 
-class LossEval:
-    """Evaluates configurations of a renderer by a loss of the picture; over 0 is a success."""
-
-    def __init__(self, renderer: Renderer, loss: Loss, spp: int) -> None:
-        self.renderer, self.loss, self.spp = renderer, loss, spp
-
-    def __call__(self, query: Query) -> Evaluation:
-        """Answer a query."""
-        renderer, derivative = self.renderer, None
-        u, seed, spp = query.u, query.number, self.spp * query.samples
-        bad, renders = renderer.non_finite, renderer.renders
-        if query.gradient:
-            value, derivative = renderer.gradient(self.loss, u, seed, spp, free=query.gradient == "free")
-        else:
-            value = self.loss(shown(renderer, u, seed, spp))
-        objective = float(value)
-        cost = (renderer.renders - renders) * query.samples
-        return Evaluation(objective, derivative, objective > 0.0, renderer.non_finite - bad, cost)
+def evaluated(renderer: Renderer, loss: Loss, spp: int, query: Query) -> Evaluation:
+    """Evaluate a configuration by a loss of the picture; over 0 is a success."""
+    u, seed, spp, derivative = query.u, query.number, spp * query.samples, None
+    bad, renders = renderer.non_finite, renderer.renders
+    if query.gradient:
+        value, derivative = renderer.gradient(loss, u, seed, spp, free=query.gradient == "free")
+    else:
+        value = loss(shown(renderer, u, seed, spp))
+    cost = (renderer.renders - renders) * query.samples
+    return Evaluation(float(value), derivative, float(value) > 0.0, renderer.non_finite - bad, cost)
 
 
 def searched(renderer: Renderer, u: Tensor, evaluations: int, *, spp: int = SPP) -> SearchResult:
@@ -246,14 +218,13 @@ def searched(renderer: Renderer, u: Tensor, evaluations: int, *, spp: int = SPP)
     """
     loss = smooth_loss(renderer.formation.resolution)
     here = float(loss(shown(renderer, u, 0, spp)))
-    evaluate = LossEval(renderer, lambda image: SHARPNESS * (loss(image) - here) - 1.0, spp)
+    evaluate = partial(evaluated, renderer, lambda image: SHARPNESS * (loss(image) - here) - 1.0, spp)
     domain = search_domain(renderer, u)
     steps = evaluations * (1 + domain.gradient_cost) + 1
     return search(partial(map, evaluate), domain, PGD(), steps=steps, seed=0, candidates=1, repeats=1)
 
 
 def search_domain(renderer: Renderer, start: Tensor | None = None) -> Domain:
-    """Return where a search of a renderer's space may look, from its start or another one."""
     space = renderer.space
     assert isinstance(space, Space)
     return judging.domain_of(

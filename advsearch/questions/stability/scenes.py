@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,9 +18,9 @@ from torch import Tensor
 from advsearch.attacks import PGD, Adam, Auto, Query, search
 from advsearch.controls.occlusion import sphere
 from advsearch.engine.gradients import smooth_loss
-from advsearch.engine.record import Results, kept_rows
+from advsearch.engine.record import Results, taken_rows
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.progress import NullProgress, Progress
+from advsearch.question import Asked
 from advsearch.questions.stability.result import (
     CASES,
     Case,
@@ -41,11 +40,11 @@ from advsearch.questions.stability.scene import (
     SHARPNESS,
     SPP,
     ControlSettings,
-    LossEval,
     black_and_white,
     checked,
     compared,
     dark,
+    evaluated,
     grey_map,
     inward,
     mesh_of,
@@ -54,7 +53,6 @@ from advsearch.questions.stability.scene import (
     shown,
     small,
 )
-from advsearch.runs.directory import RunDirectory
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset, normalised
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world
@@ -71,7 +69,6 @@ DARKNESS = grey_map(0.0)
 
 
 def exposed(control: str, low: float, high: float) -> dict[str, object]:
-    """A picture ten stops over or under, and its gradient there."""
     controls = {control: {"exposure": [low, high]}, "texture": {"resolution": 8}}
     return {"controls": controls, "u": {0: float(high > 0.0)}, "slow": control == "environment"}
 
@@ -137,7 +134,7 @@ def plateau(low: float, high: float) -> Outcome:
     """
     renderer = small({"camera": {"exposure": [low, high]}})
     start, checks, endings, flat = torch.ones_like(renderer.start), [], [], 0
-    evaluate = LossEval(renderer, lambda image: 0.9 - image.mean(), 2)
+    evaluate = partial(evaluated, renderer, lambda image: 0.9 - image.mean(), 2)
     for policy in (PGD(), Adam(), Auto()):
         domain = search_domain(renderer, start)
         result = search(partial(map, evaluate), domain, policy, steps=PLATEAU_STEPS, seed=0, candidates=0)
@@ -221,9 +218,8 @@ def texels_at_the_ends() -> Outcome:
     slope = torch.stack([raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]).mean(dim=0)
     gradient, wanted = inward(renderer, slope, 1.0, 8, REFERENCE_SPP)
     error = abs(gradient / wanted - 1.0)
-    best = search(
-        partial(map, LossEval(renderer, loss, SPP)), search_domain(renderer), PGD(), steps=3, seed=0, candidates=0
-    ).best_u
+    evaluate = partial(evaluated, renderer, loss, SPP)
+    best = search(partial(map, evaluate), search_domain(renderer), PGD(), steps=3, seed=0, candidates=0).best_u
     return seen(controls, black_and_white, compare=False).also(
         check("gradient error along a direction that points inwards", error, most=ERROR),
         check("smallest texel of the adversarial configuration", float(best.min()), least=0.0),
@@ -242,7 +238,6 @@ ONE_TEXEL = {3 * (SIDE**2 // 2 + SIDE // 2) + channel: 1.0 for channel in range(
 
 
 def thrown(u: Sequence[float] | Mapping[int, float] = WHOLE, **projector: float) -> dict[str, object]:
-    """A white picture on the mug, or another one; its gradient is finite and not zero."""
     controls = {"projector": {"resolution": SIDE, **projector}}
     return {"controls": controls, "u": u, "compare": False, "gradient": (1e-12, None)}
 
@@ -317,7 +312,6 @@ def from_a_file(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
 
 
 def outline(controls: ControlSettings) -> dict[str, object]:
-    """The mug in black on a bare sky, so that only its outline moves."""
     return {"controls": controls, "thing": dark, "settings": BARE, "u": [0.5]}
 
 
@@ -403,40 +397,29 @@ for control, name in (("pose", "yaw"), ("camera", "azimuth"), ("environment", "r
 # ---- `stability`: stiff and extreme scenes, and whether each of them holds ------------------------------------------
 
 
-def stability_from_config(
-    config: StabilityConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> StabilityResult:
+def tried_cases(asked: Asked[StabilityConfig]) -> StabilityResult:
     """Run cases of the suite one after the other, until they are done, the time is up or there is an interrupt.
 
     A case that is done is stored at once: a run that was stopped goes on with the case that it was at.
     """
-    progress, begun = progress or NullProgress(), time.perf_counter()
-    cases = chosen(config.cases, config.groups)
-    with RunDirectory.of(config, resumed) as run:
-        results = Results(run, config.seconds)
+    cases, progress = chosen(asked.config.cases, asked.config.groups), asked.progress
+    results = Results(asked.run, asked.config.seconds)
 
-        def rows() -> Iterator[CaseRow]:
-            hint = "`case` and `group` pick some, `seconds` stops before the next one"
-            progress.stage("trying stiff and extreme scenes", len(cases), hint=hint)
-            for case in cases:
-                known = results.stored(case.name) is not None
-                row = results.row(case.name, CaseRow, case.run)
-                yield row
-                if not known:
-                    progress.message(f"{case.name}: {row.status}, {row.seconds:.1f} s")
-                progress.advance(1)
+    def rows() -> Iterator[CaseRow]:
+        hint = "`case` and `group` pick some, `seconds` stops before the next one"
+        progress.stage("trying stiff and extreme scenes", len(cases), hint=hint)
+        for each in cases:
+            known = results.stored(each.name) is not None
+            row = results.row(each.name, CaseRow, each.run)
+            yield row
+            if not known:
+                progress.message(f"{each.name}: {row.status}, {row.seconds:.1f} s")
+            progress.advance(1)
 
-        def result(rows: Sequence[CaseRow], ending: str) -> StabilityResult:
-            return StabilityResult(
-                run=str(run.path),
-                ending=ending,
-                rows=list(rows),
-                not_run=[case.name for case in cases[len(rows) :]],
-                seconds={"total": time.perf_counter() - begun},
-                command_line=config.command_line(),
-            )
+    def result(rows: list[CaseRow]) -> StabilityResult:
+        return asked.result(StabilityResult, rows=rows, not_run=[each.name for each in cases[len(rows) :]])
 
-        return kept_rows(run, results, rows(), result)
+    return taken_rows(asked, results, rows(), result)
 
 
 def sentences() -> dict[str, str]:
@@ -521,7 +504,7 @@ def light_rotation_texel() -> Outcome:
     domain = search_domain(renderer, u)
     paths: list[list[Tensor]] = []
     for scale in (1.0, RATIO):
-        evaluate = LossEval(renderer, partial(lambda scale, image: scale * loss(image), scale), 8)
+        evaluate = partial(evaluated, renderer, partial(lambda scale, image: scale * loss(image), scale), 8)
         paths.append([])
         note = lambda record, at, evaluation: paths[-1].append(at)  # noqa: E731
         result = search(partial(map, evaluate), domain, PGD(), steps=18, seed=0, candidates=0, on_step=note)
