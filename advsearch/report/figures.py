@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Figures = dict[str, bytes]  # A suffix, png or svg, to the content of a file
-
 BLUE, RED, GREY = "#1d5fd0", "#b3261e", "#5c606a"
 STYLE: dict[Any, Any] = {
     "font.family": ["DejaVu Sans"], "font.size": 9.0, "legend.frameon": False, "legend.fontsize": 8.0,
@@ -141,7 +140,6 @@ def axis_title(name: str, unit: str) -> str:
 
 
 def figure_of(draw: Callable[[Any], object], size: tuple[float, float]) -> Figures:
-    """Return what is drawn on the axes of a new figure of a size in inches."""
     return drawn(lambda figure: draw(figure.subplots()), size)
 
 
@@ -153,7 +151,6 @@ TRUE, SAID = (0, 190, 255), (255, 110, 0)
 """Colours of what is true and of what the model says; told apart in any kind of colour vision."""
 SMALLEST = 512  # Pixels of the longest side at least; smaller pictures are magnified, so that text can be read
 TINT, LETTERS = 0.45, 28  # How much of a tint covers a picture; how many letters are as high as its longest side
-
 Box = tuple[float, float, float, float]
 Shape = Any  # What is drawn, a box or the pixels of a mask: `advsearch.tasks.Mark`
 

@@ -26,7 +26,6 @@ from advsearch.files import read_bytes
 
 Bytes = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
-
 INCH = 25.4
 PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}  # Width and height in millimetres
 MARGIN, FOOT = 15.0, 20.0  # White around what is printed, and more below for the ruler, millimetres

@@ -143,7 +143,6 @@ def subject_of(result: Result, given: ShownResult) -> list[str]:
 
 
 def facts_of(result: Result, given: ShownResult) -> dict[str, str]:
-    """Return by what a result came about, without what is not known."""
     renders, seconds = getattr(result, "renders", None), getattr(result, "seconds", None)
     spent = sum(renders.values()) if isinstance(renders, Mapping) else renders
     own = {
@@ -163,7 +162,8 @@ def facts_of(result: Result, given: ShownResult) -> dict[str, str]:
 def fields_shown(result: Result) -> ShownResult:
     """Return the lists of a result as tables, its other fields as facts, and what their names mean."""
     values = {name: getattr(result, name) for name in type(result).described()}
-    tables = {name: rows for name, value in values.items() if (rows := _rows(value))}
+    lists = {name: value for name, value in values.items() if isinstance(value, (list, tuple)) and value}
+    tables = {name: rows for name, rows in lists.items() if all(isinstance(row, Fields) for row in rows)}
     elsewhere = (*_ELSEWHERE, *tables, *(name.replace(" ", "_") for name in result.facts()))
     plain = {_words(name): _text(value) for name, value in values.items() if name not in elsewhere}
     described: list[tuple[Fields, set[str]]] = [(result, {name for name, text in plain.items() if text})]
@@ -183,11 +183,6 @@ def fields_shown(result: Result) -> ShownResult:
     sections.append(ResultPart("What these words mean", rows=meaning, folded=True, only="page"))
     brief = result.brief or str(values.get("ending", "done"))
     return ShownResult(brief[:1].upper() + brief[1:] + ".", sections, plain)
-
-
-def _rows(value: object) -> Sequence[Fields]:
-    rows = value if isinstance(value, (list, tuple)) else ()
-    return rows if all(isinstance(row, Fields) for row in rows) else ()
 
 
 def _text(value: object) -> str:
@@ -353,8 +348,9 @@ class InNotebook:
             axes: to draw on; None makes new ones.
         """
         axes = new_axes() if axes is None else axes
-        for part in [part for part in _shown(self).sections if part.draw][:1]:
-            part.draw(axes)  # type: ignore[misc]
+        drawn = [part.draw for part in shown(self).sections if part.draw is not None]  # type: ignore[arg-type]
+        for draw in drawn[:1]:
+            draw(axes)
         return axes
 
     def to_pandas(self) -> Any:
@@ -371,19 +367,13 @@ class InNotebook:
         return json_normalize([row.to_dict() for row in rows])
 
     def _repr_html_(self) -> str:
-        return result_html(_shown(self))
+        return result_html(shown(self))  # type: ignore[arg-type]
 
     def _repr_png_(self) -> bytes | None:
-        return result_figure(_shown(self)).get("png")
-
-
-def _shown(result: object) -> ShownResult:
-    assert isinstance(result, Result)
-    return shown(result)
+        return result_figure(shown(self)).get("png")  # type: ignore[arg-type]
 
 
 def result_html(given: ShownResult, pictures: Mapping[str, ArrayLike] | None = None) -> str:
-    """Return a result as a cell of a notebook, with pictures (H, W, 3), sRGB in [0, 1]."""
     figures = []
     for name, image in (pictures or {}).items():
         inside = _picture(png_bytes(image), SHOWN, name), element("figcaption", name)
@@ -406,7 +396,6 @@ def result_html(given: ShownResult, pictures: Mapping[str, ArrayLike] | None = N
 
 
 def result_figure(given: ShownResult) -> Figures:
-    """Return the figure of a result as files; none where nothing of it is drawn."""
     for part in given.sections:
         if part.draw is not None:
             return figure_of(part.draw, part.size or (WIDTH, part.height / PIXELS))

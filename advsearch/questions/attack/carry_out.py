@@ -79,12 +79,10 @@ def attack_once(
 
 
 def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
-    """Attack a model on a scene that are there, in place of those that the configuration names; nothing is kept."""
     return carry_out(parts_of(config, scene, model), NullProgress())
 
 
 def carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None = None) -> AttackResult:
-    """Do it all, or what is left of a run, in a run directory if it is kept."""
     with ExitStack() as stack:
         kept = None if resumed is None else stack.enter_context(RunDirectory.of(job.config, resumed))
         stages = Stages(progress)
@@ -206,7 +204,6 @@ def controls_given(
 def task_and_objective(
     config: AttackConfig, task: AnyTask, objective: AnyObjective | None
 ) -> tuple[Task, AnyObjective]:
-    """The task, and the objective that was asked for or else the task's own, checked before anything is loaded."""
     made = make_task(task)
     wanted = made.objective if objective is None else objective
     check_objective(wanted, made.name, targeted=config.target is not None, minimise=config.minimise)
@@ -214,7 +211,6 @@ def task_and_objective(
 
 
 def models_as_one(model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
-    """Load the model, or the models of an ensemble as one; their warnings become sentences of the run."""
     models, warnings = load_models(several(model), task, config)
     return models[0] if len(models) == 1 else together(models, config.resolution), warnings
 
@@ -293,7 +289,6 @@ def _task(job: AttackParts, *, shows: bool = True) -> tuple[Task, Callable[[Desc
 
 
 def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
-    """Return the steps of a search, and how many conditions each looks at, where neither was asked for."""
     if problem.conditions is None:
         return config.steps or numbers.STEPS, 1
     usual = numbers.OVER_ONE if problem.conditions.dim == 1 else numbers.OVER_PREDICTED
@@ -305,7 +300,6 @@ def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
 
 
 def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
-    """Whether a file can name a task or a policy, with all of its options."""
     try:
         return bool(make(as_setting(entry)) == entry)
     except InputError:

@@ -124,7 +124,6 @@ def ambient_part(summary: AttackSummary) -> list[ResultPart]:
 
 
 def failures_text(known: DifferentFailures) -> str:
-    """Return how many different failures there are, and which of that is verified."""
     where = f"{known.found} of {words.count(known.seen, 'draw')}"
     if known.places is not None:
         where = f"{known.found} of {known.places} cells over {' and '.join(known.over)} ({known.seen} were seen)"

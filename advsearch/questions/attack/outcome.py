@@ -38,7 +38,6 @@ def summarise(
     config: AttackConfig, objective: str | None, findings: Findings, journal: Journal, stages: Stages,
     warnings: Sequence[str],
 ) -> AttackResult:  # fmt: skip
-    """Put the result together and, if there is a run directory, write its files."""
     problem, search, run = journal.problem, findings.search, journal.run
     space, start = problem.searched_space, problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
@@ -115,7 +114,6 @@ def _alone(values: dict[str, T]) -> T | dict[str, T]:
 
 
 def _seen(problem: Problem, findings: Findings, clean: KeptPicture, adversarial: KeptPicture) -> dict[str, object]:
-    """What a summary says of the findings; of what was not reached, that there is nothing."""
     baseline, checked, bracket = findings.baseline, findings.verification, findings.smallest
     ending = Ending.INTERRUPTED
     if not findings.interrupted and checked is not None:
@@ -336,7 +334,6 @@ def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str
 
 
 def described_failures(problem: Problem, findings: Findings) -> DifferentFailures | None:
-    """Return what a summary says of the different failures; None of a policy that looks for one."""
     known = findings.search.failures if findings.search else None
     if known is None:
         return None

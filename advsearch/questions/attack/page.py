@@ -113,7 +113,6 @@ def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[
 
 
 def _changes(summary: AttackSummary) -> ResultPart:
-    """The adversarial configuration in a few values, each beside its range where it has one."""
     rows, bars = [], []
     for name, changed in (summary.configuration or {}).items():
         clean = "" if changed.clean is None else number_text(changed.clean)

@@ -10,6 +10,7 @@ from statistics import mode
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from PIL import Image
 from torch import Tensor
@@ -263,7 +264,6 @@ def trial_to_show(findings: Findings) -> int | None:
 
 
 def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, shown: Mapping[str, KeptPicture]) -> None:
-    """Write the pictures of the clean and the adversarial scene, of their difference, of trials and of the search."""
     for name, kept in shown.items():
         run.save_image(name, kept.picture)
         run.save_exr(name, kept.radiance * problem.renderer.formation.gain)
@@ -294,7 +294,6 @@ def save_trial(
 
 
 def save_marked(run: RunDirectory, name: str, picture: Tensor, marks: list[Mark]) -> None:
-    """Write ``<name>-prediction.png``, the picture with marks; nothing where there are none."""
     if marks:
         run.save_image(f"{name}-prediction", marked(picture.numpy(), marks))
 
@@ -357,28 +356,33 @@ def along_drive(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory 
     for name, at in (("drive-clean", start[: len(problem.domain.start)]), ("drive", u)):
         if at is None:
             continue
-        frames, counts[name] = list[Image.Image](), 0
+        pictures, counts[name] = list[npt.NDArray[np.float32]](), 0
         for number, whole in enumerate(times):
             whole[: len(at)] = at
             with torch.no_grad():
                 picture = to_8_bit(problem.renderer(whole, seed=seeds.stream(problem.seed, "drive", number), spp=spp))
             right, marks = problem.seen(picture, whole)
             counts[name] += right
-            frames.append(Image.fromarray(files.to_8bit(marked(picture.numpy(), marks))))
+            pictures.append(np.asarray(marked(picture.numpy(), marks), dtype=np.float32))
         if run is not None:
-            write_drive(run, name, frames, seconds * max(1, len(ways)))
+            write_drive(run, name, pictures, seconds * max(1, len(ways)))
     return AlongDrive(
         frames=len(times), seconds=seconds, paths=[str(way) for way in ways], clean=counts["drive-clean"],
         answer=counts.get("drive"), spp=spp,
     )  # fmt: skip
 
 
-def write_drive(run: RunDirectory, name: str, frames: Sequence[Image.Image], seconds: float) -> None:
-    """Write frames as an animation, NAME.webp, and some of them, evenly spaced, side by side, NAME.png, into a run."""
+def write_drive(run: RunDirectory, name: str, pictures: Sequence[npt.NDArray[np.float32]], seconds: float) -> None:
+    """Write frames (h, w, 3) in sRGB as an animation, NAME.webp, and some side by side, NAME.png, into a run."""
+    frames = [Image.fromarray(files.to_8bit(picture)) for picture in pictures]
     file, pause = io.BytesIO(), max(FASTEST, round(1000.0 * seconds / len(frames)))
     frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], duration=pause, loop=0, quality=80)
     write_bytes(run.path / IMAGES / f"{name}.webp", file.getvalue())
     size = max(1, round(frames[0].width * SIDE / frames[0].height)), SIDE
-    numbers = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), STRIP)).round().astype(np.int64))
-    small = [frames[number].resize(size, Image.Resampling.LANCZOS) for number in numbers]
+    small = [frames[number].resize(size, Image.Resampling.LANCZOS) for number in evenly(len(frames), STRIP)]
     run.save_image(name, np.concatenate([np.asarray(frame, dtype=np.float32) / 255.0 for frame in small], axis=1))
+
+
+def evenly(count: int, most: int) -> npt.NDArray[np.int64]:
+    """Return the numbers of some of so many frames, evenly spaced, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))

@@ -116,7 +116,6 @@ class Attack:
         self.journal.set_note(PLAN, chosen)
 
     def _measure(self) -> None:
-        """Replace the first gradient plan by a measured one, as far as the preparation wants that."""
         problem, config, tick = self.problem, self.config, self.stages.progress.advance
         full = config.measure == "full"
         if config.measure == "no" or not self.policy.uses_gradient:
@@ -133,10 +132,8 @@ class Attack:
             renderer, problem.loss, u, seed=seed, spp=problem.spp, every=full, counted=counted, tick=tick
         )
         if full:
-            samples, hint = (
-                planning.cosine_samples(problem.plan),
-                "counted in samples a pixel; `measure=quick` leaves it out",
-            )
+            samples = planning.cosine_samples(problem.plan)
+            hint = "counted in samples a pixel; `measure=quick` leaves it out"
             self.stages.begin("setup", "choosing step and samples of gradients", samples, hint=hint, at_most=True)
             table = list(planning.cosines(renderer, problem.loss, u, seed=seed, tick=tick))
             problem.plan, spp = planning.tuned(problem.plan, table)
@@ -364,7 +361,6 @@ def find_smallest(attack: Attack, verifier: Verifier) -> None:
         return results[-1].best_u
 
     def passes(u: Tensor, check: int, few: int = trials) -> bool:
-        """Whether all trials together pass; so `few` do without a failure."""
         allowed, scores, failures = problem.rule.allowed(trials), list[float](), 0
         while len(scores) < trials and failures <= allowed and (failures or len(scores) < few):
             (trial,) = verifier.trials(f"check {check}", {len(scores): u})
@@ -392,7 +388,6 @@ def find_smallest(attack: Attack, verifier: Verifier) -> None:
 
 
 def _rank(verification: Verification) -> tuple[bool, float, float]:
-    """How bad a configuration is for the model: found, then the rate of successes, then the mean margin."""
     scores = [trial.score for trial in verification.counting]
     mean = sum(scores) / len(scores)
     return verification.ending is Ending.FOUND, verification.adversarial.rate, mean if mean == mean else -math.inf

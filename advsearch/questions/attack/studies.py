@@ -196,7 +196,6 @@ class StudyRun:
         return self.asked.ending == INTERRUPTED
 
     def attack(self, study: StudyAttack, clean: CleanMatrix | None = None) -> AttackSummary | None:
-        """Return the summary of one attack, or None if there was an interrupt; `clean` as for `attack_once`."""
         if self.interrupted:
             return None
         config, path = study.config, self.run.path / PARTS / study.name

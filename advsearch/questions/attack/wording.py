@@ -89,7 +89,6 @@ def remarks(summary: AttackSummary) -> list[str]:
 
 
 def success(summary: AttackSummary) -> str:
-    """Return one word for a trial that counts: ``wrong``, ``target`` or ``easier``."""
     return "target" if summary.target else "easier" if summary.minimises else "wrong"
 
 
@@ -273,7 +272,6 @@ def _short(value: float) -> str:
 
 
 def transport_text(summary: AttackSummary) -> str:
-    """Return whether a matrix predicted the pictures of the searches, and how far it was off; empty: not known."""
     transport = summary.transport
     if transport is None:
         return ""

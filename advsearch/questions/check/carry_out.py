@@ -40,7 +40,6 @@ REFERENCE_SPP, SEEDS = 64, (6, 16)
 """Samples a pixel of a reference render, and how many seeds it gets: until its noise is small."""
 FEW_SEEDS = (3, 6)  # seeds of a reference of the model's loss, whose renders have more samples
 HINT = "`resolution` or fewer controls shorten it, `seconds` ends it"
-
 Finding = CheckedRow | SearchPlan | PathLength | GainRow | TexelRow
 FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
 
@@ -107,7 +106,6 @@ def parts_of(config: CheckConfig) -> list[CheckedPart]:
 
 
 def _findings_of(part: CheckedPart, parts: int, results: Results, progress: Progress) -> Iterator[Finding]:
-    """What is found of a part, as it comes; of one that was measured before, without loading anything."""
     stored = results.stored(part.key)
     if stored is not None:
         yield from FINDINGS.validate_python(stored)
@@ -127,7 +125,6 @@ def _findings_of(part: CheckedPart, parts: int, results: Results, progress: Prog
 
 
 def _linear(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[CheckedRow]:
-    """Every estimator of each parameter, by a smooth linear loss of the raw picture."""
     config = part.config
     problem, _ = problem_from_config(config, denoise="none")
     problem.renderer.formation = replace(problem.renderer.formation, transfer="linear")
@@ -140,7 +137,6 @@ def _linear(part: CheckedPart, title: str, results: Results, progress: Progress)
 
 
 def _model(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[Finding]:
-    """What a search by the model's loss does: its plan, how good that is, and what it leaves out."""
     config = part.config
     problem, _ = problem_from_config(config)
     renderer, u = problem.renderer, inside(problem.renderer)
@@ -187,7 +183,6 @@ def _derivatives(
 
 
 def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, progress: Progress) -> Iterator[Finding]:
-    """How a search gets its derivatives, and what it leaves out with what that saves."""
     config, renderer, u = part.config, problem.renderer, inside(problem.renderer)
     summary, used = problem.plan_summary(renderer.plan), {group.estimator for group in renderer.plan.groups}
     not_computed = {

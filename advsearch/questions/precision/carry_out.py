@@ -107,9 +107,9 @@ class Measurement:
         self.sittings: list[tuple[str, float, Callable[[TimeBudget], Sitting]]] = []
         if "image" in wanted:
             self.sittings.append(("image", SHARES["image"], self._pictures))
-        if "gradient" in wanted:
+        for part in parts if "gradient" in wanted else ():
             share = SHARES["gradient"] / len(parts)
-            self.sittings += [(f"gradient of {part.name}", share, partial(self._gradients, part)) for part in parts]
+            self.sittings.append((f"gradient of {part.name}", share, partial(self._gradients, part)))
 
     def round_up(self, point: PrecisionPoint, samples: float) -> int:
         """Return the next number of samples that a setting takes. A line of the picture is named after its sampler; one
@@ -171,12 +171,11 @@ class Measurement:
                 points.append(point_of(named, [each[quantity] for each in samples], bench.floor(setting, quantity)))
         lines: dict[str, list[str]] = {}
         for setting in measured.left_out:
-            lines.setdefault(setting.estimator, []).append(str(setting.spp))
-        left_out = [f"{title} by {name}: {', '.join(counts)} samples" for name, counts in lines.items()]
+            lines.setdefault(f"{title} by {setting.estimator}", []).append(str(setting.spp))
+        left_out = [f"{line}: {', '.join(counts)} samples" for line, counts in lines.items()]
         return Sitting(points=points, references=references, left_out=left_out, took=time.perf_counter() - begun)
 
     def _stage(self, name: str, budget: TimeBudget) -> Callable[..., None]:
-        """Begin a stage that ends with a budget of seconds, and return what tells how many have passed."""
         total, done = max(1, math.ceil(budget.left)), 0
         self._progress.stage(name, total, hint="counted in seconds; `seconds` sets them", at_most=True)
 
@@ -219,7 +218,6 @@ def recommended(
 
 
 def timing_machine(cpu_info: Path = Path("/proc/cpuinfo")) -> room.Machine:
-    """Return what a time has to be read with: processor (by Linux), cores, and the threads in use."""
     used = {"torch": torch.get_num_threads()}
     if "drjit" in sys.modules:
         used["render"] = int(sys.modules["drjit"].thread_count())

@@ -230,7 +230,6 @@ def shown(result: PrecisionResult) -> ShownResult:
 
 
 def headline(result: PrecisionResult) -> str:
-    """Return the result in one line: what an error takes, of the first quantity that reaches it."""
     found = next((row for row in result.recommendations if row.estimator), None)
     if found is None:
         return "Nothing that was measured is known to reach the error: give it more `seconds` or a larger `error`."

@@ -49,7 +49,6 @@ class SampleSetting:
 
     @property
     def line(self) -> tuple[str, str, str]:
-        """What all settings of one line of a diagram share."""
         return self.quantity, self.control, self.estimator
 
 

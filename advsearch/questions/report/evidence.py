@@ -80,7 +80,6 @@ def conditions_of(result: Result, photographs: Sequence[Row] | None = None) -> l
 
 
 def _has(value: float | str, of: AxisValue) -> bool:
-    """Whether a value of a row is that of an axis, or lies in that part of its range."""
     if isinstance(value, str) or isinstance(of, str):
         return value == of
     return of[0] <= value <= of[1] if isinstance(of, tuple) else math.isclose(value, of)
@@ -199,7 +198,6 @@ QUICK = "Made by a quick recipe: few and small pictures, to see what comes out; 
 
 
 def claims_of(result: Result) -> list[Claim]:
-    """Return what a run stands for; one that stands for nothing says so in a claim of that kind."""
     if result.goes_on:
         state = "is running" if getattr(result, "ending", "") == RUNNING else "is not finished"
         return [nothing_claimed(f"the run {state}" + (f"; so far: {result.brief}" if result.brief else ""))]
@@ -277,7 +275,6 @@ def evidence_of(
 
 
 def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
-    """Return what could change and how far, a line for each part of it."""
     lines = []
     if isinstance(result, AttackSummary):
         lines.append(attack_wording.changed_text(result))
@@ -343,7 +340,6 @@ def _measured(result: Result, settings: Mapping[str, object], judged_by: Mapping
 
 
 def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
-    """What a reader has to know beside the claims: what stood still, what failed, the run's own warnings."""
     lines = ["Nothing varied but what stands under What varied, and the noise of the renders."]
     if isinstance(result, AttackSummary):
         lines += [remark for remark in attack_wording.remarks(result) if remark not in result.warnings]
@@ -365,7 +361,6 @@ def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
 
 
 SUITE = "suite"  # the note of a run of `test` that has its claims
-
 MOST_OF_PICTURE = 16 << 20  # bytes of a picture that is taken along
 
 
@@ -475,7 +470,6 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
 
 
 def _of_a_suite(suite: Any) -> list[str]:
-    """What the claims of a suite vary, as a run has kept it."""
     lines = defaultdict[str, list[str]](list)
     try:
         for name, claim in suite["claims"].items():
@@ -494,7 +488,6 @@ def _of_a_suite(suite: Any) -> list[str]:
 
 
 def _judged_by(named: Any) -> dict[str, object]:
-    """The options of the task that a run was judged by; nothing of one that is not to be had here."""
     if named is None:
         return {}
     from advsearch.tasks import make_task  # they bring torch, which takes a second

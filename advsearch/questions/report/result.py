@@ -95,7 +95,6 @@ NO_CONFORMITY = (
 
 
 def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
-    """Yield what shares by condition are of, the heads of their table and its rows, of those that a run has."""
     for title, first, verb, conditions in (
         ("Right", "condition", "right", run.conditions),
         ("Photographs that agree", "photographs of", "agree", run.photographs),

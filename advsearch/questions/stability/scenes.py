@@ -15,7 +15,7 @@ import OpenEXR
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Adam, Auto, Query, search
+from advsearch.attacks import PGD, Adam, Auto, Query
 from advsearch.controls.occlusion import sphere
 from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.record import Results, taken_rows
@@ -49,6 +49,7 @@ from advsearch.questions.stability.scene import (
     inward,
     mesh_of,
     search_domain,
+    searched,
     seen,
     shown,
     small,
@@ -134,14 +135,13 @@ def plateau(low: float, high: float) -> Outcome:
     """
     renderer = small({"camera": {"exposure": [low, high]}})
     start, checks, endings, flat = torch.ones_like(renderer.start), [], [], 0
-    evaluate = partial(evaluated, renderer, lambda image: 0.9 - image.mean(), 2)
+    loss = lambda image: 0.9 - image.mean()  # noqa: E731
     for policy in (PGD(), Adam(), Auto()):
-        domain = search_domain(renderer, start)
-        result = search(partial(map, evaluate), domain, policy, steps=PLATEAU_STEPS, seed=0, candidates=0)
+        result = searched(renderer, loss, PLATEAU_STEPS, spp=2, start=start, policy=policy)
         flat += sum(record.gradient_norm == 0.0 for record in result.history)
         checks.append(holds(f"{policy.name} finds a picture that is not white", result.best_objective > 0.0))
         endings.append(f"{policy.name}: {result.ending.value}")
-    slope = evaluate(Query(start, 0, gradient=True)).gradient
+    slope = evaluated(renderer, loss, 2, Query(start, 0, gradient=True)).gradient
     assert slope is not None
     at_first = check("gradient at the start", float(slope.abs().max()), 0.0, 0.0)
     measured = {"evaluations without a gradient": float(flat)}
@@ -176,13 +176,11 @@ def _glass(part: GlassBall) -> Translation:
 
 
 def glass() -> GlassBall:
-    """A ball of clear glass between the mug and the camera, which covers part of it."""
     x, y, z = (float(value) for value in camera_to_world(describe("mug"))[:3, 3] * 0.6 + np.array([0.0, 0.0, 0.2]))
     return GlassBall("glass", (x, y, z), 0.3)
 
 
 def surface(searched: tuple[str, ...], slow: bool = True, **values: float) -> dict[str, object]:
-    """A surface with numbers at the ends of their range, and the derivative by some of them there."""
     settings = {f"material.{name}": value for name, value in values.items()}
     return {"controls": {"material": {name: [0.0, 1.0] for name in searched}}, "settings": settings, "slow": slow}
 
@@ -218,8 +216,7 @@ def texels_at_the_ends() -> Outcome:
     slope = torch.stack([raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]).mean(dim=0)
     gradient, wanted = inward(renderer, slope, 1.0, 8, REFERENCE_SPP)
     error = abs(gradient / wanted - 1.0)
-    evaluate = partial(evaluated, renderer, loss, SPP)
-    best = search(partial(map, evaluate), search_domain(renderer), PGD(), steps=3, seed=0, candidates=0).best_u
+    best = searched(renderer, loss, 3).best_u
     return seen(controls, black_and_white, compare=False).also(
         check("gradient error along a direction that points inwards", error, most=ERROR),
         check("smallest texel of the adversarial configuration", float(best.min()), least=0.0),
@@ -287,7 +284,6 @@ BARE = {"ground.size": 0.0}  # settings without the ground, so that a dark objec
 
 
 def mesh(thing: ObjectAsset, beside: ObjectAsset | None = None) -> dict[str, object]:
-    """A mesh of our own, seen from the front: painted and shifted."""
     like = {"beside": {"thing": beside, "settings": FRONT}} if beside else {}
     return {"controls": PAINTED, "thing": thing, "settings": FRONT, "slow": True, **like}
 
@@ -306,7 +302,6 @@ def box_in_a_file(scale: float = 1.0, shift: float = 0.0) -> ObjectAsset:
 
 
 def from_a_file(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
-    """A box in a file, which has to look like the same box at home."""
     thing = partial(box_in_a_file, scale, shift)
     return {"controls": SHIFT, "thing": thing, "compare": False, "beside": {"thing": box_in_a_file}}
 
@@ -423,7 +418,6 @@ def tried_cases(asked: Asked[StabilityConfig]) -> StabilityResult:
 
 
 def sentences() -> dict[str, str]:
-    """Return what must hold in each case, by its name; behind the group that it is of."""
     return {case.name: f"{case.group}: {case.holds}" for case in CASES}
 
 
@@ -501,13 +495,12 @@ def light_rotation_texel() -> Outcome:
     steps = [0.2, renderer.plan.groups[1].step * 2.0, 0.08]
     second = hessian(lambda at: SHARPNESS * float(loss(shown(renderer, at, 0, 64))), u, directions, steps)
     units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
-    domain = search_domain(renderer, u)
     paths: list[list[Tensor]] = []
     for scale in (1.0, RATIO):
-        evaluate = partial(evaluated, renderer, partial(lambda scale, image: scale * loss(image), scale), 8)
         paths.append([])
         note = lambda record, at, evaluation: paths[-1].append(at)  # noqa: E731
-        result = search(partial(map, evaluate), domain, PGD(), steps=18, seed=0, candidates=0, on_step=note)
+        scaled = partial(lambda scale, image: scale * loss(image), scale)
+        result = searched(renderer, scaled, 18, spp=8, start=u, on_step=note)
     path, again = map(torch.stack, paths)
     moved = (path - path[0]).abs().amax(dim=0)
     names = {"condition number in u": second, "condition number in watts, degrees and sRGB": units @ second @ units}

@@ -111,7 +111,6 @@ class _SuiteRun:
         return OUT_OF_TIME if any(TIME_OVER in tried.reason for tried in self.results) else "done"
 
     def _tried(self, claim: PlannedClaim, results: Results) -> ClaimResult:
-        """What a claim says; what is decided, or has used its pictures, is stored."""
         key, trial = f"claim {claim.name}", self.trial
         if (stored := results.stored(key)) is not None:
             return ClaimResult.of(stored)

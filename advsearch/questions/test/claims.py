@@ -39,11 +39,8 @@ from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.settings import split_names
 
 MANY = 4  # values of a configuration that are said in words, at most
-
 MOST_KEPT = 64  # of a configuration with more numbers, a picture's row does not hold the values
-
 AHEAD = 2  # pictures that are asked for at once, for each worker
-
 ATTACK_WORKER = "advsearch.questions.attack.carry_out:attack_worker"
 
 
@@ -71,7 +68,6 @@ class Trial:
         return self.passed >= self.seconds
 
     def claim(self, asked: ClaimResult, claim: AnyClaim, config: SceneConfig) -> ClaimResult:
-        """Try a claim that is asked and undecided; what was asked before is read back."""
         if isinstance(claim, ShareClaim | NoWorseClaim):
             return self._by_pictures(asked, claim, config)
         assert isinstance(config, AttackConfig)
@@ -145,7 +141,6 @@ class Trial:
         return asked.model_copy(update=outcome)
 
     def _changed(self, claim: ChangeClaim, config: SceneConfig, problem: Problem) -> Callable[[Query, Tensor], Tensor]:
-        """What changes a picture as a claim says; where the object is away, it is rendered again."""
         if claim.when != AWAY:
             return lambda query, picture: changed(picture, claim.when, problem.model.cameras)
         other = self._problem(config)
@@ -242,7 +237,6 @@ class Trial:
 
 
 def claim_worker(settings: JsonObject) -> Callable[[Any], Any]:
-    """Return what evaluates the queries of a claim about two models, named by their place: what a worker does."""
     models = split_names(str(settings["model"]))
 
     def problem(name: str) -> Problem:

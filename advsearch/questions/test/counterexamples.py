@@ -47,7 +47,6 @@ side of the squares of texels that have one."""
 PICTURE = ".jpg"  # how the name of the picture ends
 LARGEST = 1 << 24  # most bytes of a file, and most numbers of a configuration
 MEMORY = 1 << 27  # bytes that unpacking one may take
-
 TRIALS = {False: 6, True: 20}  # fresh renders that try one, and one that has to hold under many conditions
 
 OF_SEARCH = (
@@ -132,7 +131,6 @@ class Counterexample:
     moved: Floats
 
     def config_for(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
-        """Return what it is tried with: the run's scene, and the suite's model."""
         of_suite = {name: value for name, value in suite.settings.items() if name in OF_MODEL}
         changed = {name: value for name, value in changes.items() if value is not None}
         plain = {**self.config.plain(), "run": None}
@@ -141,7 +139,6 @@ class Counterexample:
         return AttackConfig(**{**plain, **of_suite, "seed": suite.seed, **changed})
 
     def configuration(self, start: Tensor) -> Tensor:
-        """Return u, (d,) float32, from that of the clean scene."""
         if start.numel() != len(self.moved):
             raise InputError(
                 f"{self.path}: has {len(self.moved)} numbers, and its scene has {start.numel()} now; remove it, or "
@@ -151,12 +148,10 @@ class Counterexample:
 
 
 def folder_of(suite: str) -> Path:
-    """Return the folder of a suite's counterexamples, and of what is expected of it."""
     return Path(suite).with_suffix(".counterexamples")
 
 
 def scene_digest(scene: Scene) -> str:
-    """Return the SHA-256 of object, environment and given values, in hexadecimal."""
     described, digest = scene.description, hashlib.sha256()
     mesh, light = described.object.mesh, described.environment
     for array in (mesh.vertices, mesh.faces, mesh.uvs, described.object.base_color, light.radiance if light else None):
@@ -215,7 +210,6 @@ def remove(example: Counterexample) -> None:
 
 
 def counterexamples(suite: str) -> list[Counterexample]:
-    """Return those of a suite, by name; a FileFormatError where one is damaged."""
     folder = folder_of(suite)
     return [_read(path) for path in sorted(folder.glob("*.json")) if path.name != EXPECTED]
 

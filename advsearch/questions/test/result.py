@@ -24,7 +24,6 @@ from advsearch.runs.results import INTERRUPTED, RUNNING, Fields, Interval, JsonF
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"
 VERDICTS = (HELD, UNDECIDED, FAILED)  # from the best to the worst
-
 STATUS = {HELD: 0, FAILED: 1, UNDECIDED: 2}  # exit status of the command, by what the suite says as a whole
 
 
@@ -92,7 +91,6 @@ def verdict(claims: list[ClaimResult]) -> str:
 
 
 RESULT = SuiteResult
-
 TABLE_HEADS = ("claim", "verdict", "pictures", "why")
 
 NOTE = (
@@ -161,7 +159,6 @@ def difference_reason(verdict: str, counts: tuple[int, int, int], interval: tupl
 
 
 def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, str]:
-    """Return what a search says of a claim that there is nothing to find, and why."""
     verified, clean = summary.verified, summary.clean.control
     if summary.ending == "already wrong":
         right = "" if clean is None else f": right in {clean.correct} of {clean.trials} trials"
@@ -185,7 +182,6 @@ def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, s
 
 
 def tried_reason(right: int, wrong: int, label: str, interval: tuple[float, float] | None) -> tuple[str, str]:
-    """Return what trials of a counterexample say, and why; the interval is of the share of right predictions."""
     if interval is None:
         return UNDECIDED, TIME_OVER
     if not wrong:
@@ -226,7 +222,6 @@ def facts(result: SuiteResult) -> dict[str, str]:
 
 
 def claims(result: SuiteResult) -> Iterator[Claim]:
-    """Yield what the run stands for: what each claim of the suite came to, by its own test."""
     for tried in result.claims:
         text = f"{tried.name}: that {tried.statement} is {tried.answer}: {tried.reason}."
         kind: Kind = "nothing claimed" if tried.answer == UNDECIDED else "measured"
@@ -334,7 +329,6 @@ def _xml(text: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """A text in which Markdown has nothing to read."""
     return re.sub(r"([\\`*_{}\[\]<>#|])", r"\\\1", " ".join(text.split()))
 
 
