@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_args, get_type_hints
@@ -84,6 +84,17 @@ class Asked(Generic[Settings]):
         return kind(**{**common, "command_line": self.config.command_line(), **fields})
 
 
+def carried_out(function: Callable[[Asked[Settings]], AnyResult], asked: Asked[Settings]) -> AnyResult:
+    """Return the result of a function, which is kept in its run with its page and its figure."""
+    with asked:
+        result = function(asked)
+        if "run" not in vars(asked):  # else the function has kept it itself
+            return result
+        for suffix, data in result_figure(shown(result)).items():
+            write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
+        return keep_result(asked.run, result)
+
+
 def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path | None = None) -> Result:
     """Ask the question that a configuration asks, and keep the run in a directory.
 
@@ -134,13 +145,7 @@ class Question(Generic[AnyResult]):
         self, config: Any, *, progress: Progress | None = None, resumed: Path | None = None, **more: Any
     ) -> AnyResult:
         """Do what a configuration describes, and keep it in its run; `more` is for the function alone."""
-        with Asked(config, progress, resumed) as asked:
-            result = self.function(asked, **more)
-            if "run" not in vars(asked):  # else the function has kept it itself
-                return result
-            for suffix, data in result_figure(shown(result)).items():
-                write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
-            return keep_result(asked.run, result)
+        return carried_out(partial(self.function, **more), Asked(config, progress, resumed))
 
     def __call__(self, *args: Any, **settings: Any) -> AnyResult:
         """Ask it from Python."""
