@@ -41,11 +41,9 @@ class Features:
     penultimate: bool = True  # False where they are the logits, for want of anything else
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Return the features (N, F), float32, of images as `Model` takes them; differentiable.
-
-        One more run of the network: the logits are not computed along. Raises InputError: not an image, or values that
-        are clearly not in [0, 1].
-        """
+        """Return the features (N, F), float32, of images as `Model` takes them; differentiable. One more run of the
+        network: the logits are not computed along. Raises InputError: not an image, or values that are clearly not in
+        [0, 1]."""
         images = checked_images(images)
         batches = images.split(self.model.batch_limits[1])
         features: Tensor = joined([self.read(self.model.prepared(b))[: len(b)].float() for b in batches])

@@ -80,10 +80,8 @@ def find_label_set(text: str | int | Sequence[str | int], labels: Sequence[str],
 
 def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     """Return index and name of the classes whose names are like `word`, best first, and then those that mean the same.
-
     What is like a word says `resembling`; what means the same ("cup" for "mug") is a table of everyday things. The name
-    is the part of the label that matched: "frying pan" of "frying pan, frypan, skillet".
-    """
+    is the part of the label that matched: "frying pan" of "frying pan, frypan, skillet"."""
     table = {name: indices for name, indices in _name_table(labels).items() if "," not in name}
     everyday = [[_key(name) for name in names] for names in json.loads((DATA / "synonyms.json").read_text("utf-8"))]
     key = _key(word)

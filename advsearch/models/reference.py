@@ -188,10 +188,8 @@ class Trainable:
 
 def trainable(model: Model, layers: str = "all", *, logits: bool = True) -> Trainable:
     """Return a copy of a model's network to train further: all `layers`, or the "last" one that has parameters. Raises
-    ModelError: as `copied_network`, or the network returns something other than `logits`, where it has to.
-
-    It stays in evaluation mode: statistics of batches stay what they were learned as, and nothing is dropped.
-    """
+    ModelError: as `copied_network`, or the network returns something other than `logits`, where it has to. It stays in
+    evaluation mode: statistics of batches stay what they were learned as, and nothing is dropped."""
     if logits and (model.probabilities or model.read is not None):
         raise ModelError(f"model {model.name}: only a classifier that returns logits can be hardened")
     net = copied_network(model)

@@ -101,11 +101,9 @@ def overlap_with(one: Detections, truth: Place) -> Tensor:
 
 
 def suppressed(one: Detections, least: float, iou: float) -> Detections:
-    """Return what suppression leaves of boxes with a score of every class: the score of one that it removes is 0.
-
-    What has a score under `least` counts for nobody and is left alone. The choice has no derivative; what is left has.
-    Boxes that come with their labels are left as they are, and so are all where `iou` is 1.
-    """
+    """Return what suppression leaves of boxes with a score of every class: the score of one that it removes is 0. What
+    has a score under `least` counts for nobody and is left alone. The choice has no derivative; what is left has. Boxes
+    that come with their labels are left as they are, and so are all where `iou` is 1."""
     if "labels" in one or iou == 1.0 or not len(one["boxes"]):
         return one
     scores, boxes = one["scores"].detach(), one["boxes"].detach()

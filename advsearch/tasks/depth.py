@@ -87,11 +87,9 @@ class Distances:
 
     @cached_property
     def behind(self) -> Tensor:
-        """The disparity of what is behind the object, as far as it can be told, (H, W): NaN where it can't.
-
-        It is that of the nearest pixels beside the object in the same row, in a straight line between both: exact of a
-        plane. What is infinitely far has a disparity of 0.
-        """
+        """The disparity of what is behind the object, as far as it can be told, (H, W): NaN where it can't. It is that
+        of the nearest pixels beside the object in the same row, in a straight line between both: exact of a plane. What
+        is infinitely far has a disparity of 0."""
         height, width = self.mask.shape
         inverse, column = self.z.reciprocal(), torch.arange(width).expand(height, width)
         left = torch.where(self.mask, -1, column).cummax(dim=1).values
@@ -235,18 +233,14 @@ class Depth(Task):
     # ---- scores -----------------------------------------------------------------------------------------------------
 
     def loss(self, output: Sequence[Map], truth: Distances) -> Tensor:
-        """Return by how much more than the tolerance the object's distance is off, (N,).
-
-        That is the mean over its pixels of |log(judged / true)|, less log(1 + tolerance).
-        """
+        """Return by how much more than the tolerance the object's distance is off, (N,). That is the mean over its
+        pixels of |log(judged / true)|, less log(1 + tolerance)."""
         return self._each(output, truth, lambda factors: factors.abs().mean() - self._bar)
 
     def score(self, output: Sequence[Map], truth: Distances) -> Tensor:
-        """Return how near each of N outputs is to what is sought, (N,): over 0 where it is a success.
-
-        "nearer" and "farther" take the mean over pixels with its sign. "gone" is the lesser of the loss, and of how
-        far the share of the object's relief that is left lies under a half; see `_relief`.
-        """
+        """Return how near each of N outputs is to what is sought, (N,): over 0 where it is a success. "nearer" and
+        "farther" take the mean over pixels with its sign. "gone" is the lesser of the loss, and of how far the share of
+        the object's relief that is left lies under a half; see `_relief`."""
         if self.minimise or not self.seek:
             return super().score(output, truth)
         if self.seek == "gone":
@@ -277,9 +271,7 @@ class Depth(Task):
 
     def _judged(self, one: Map, truth: Distances) -> tuple[Tensor, bool]:
         """What the model says of every pixel, (H, W) z-depth as the truth has it, or its inverse; and which of the two.
-
-        A map is brought to the size of the picture as transformers does it in `post_process_depth_estimation`.
-        """
+        A map is brought to the size of the picture as transformers does it in `post_process_depth_estimation`."""
         ((said, values),) = one.items()
         kind = self.kind or said
         size = (truth.mask.shape[0], truth.mask.shape[1])
@@ -357,10 +349,8 @@ class Depth(Task):
 
 def _fitted(values: Tensor, wanted: Tensor, at: Tensor) -> Tensor:
     """Return a scale times the values (H, W) plus a shift, the nearest to what is wanted where `at` (H, W) says, by
-    least squares; there is a pixel there, and what is wanted is finite.
-
-    A scale is not negative: what the model holds for near stays near.
-    """
+    least squares; there is a pixel there, and what is wanted is finite. A scale is not negative: what the model holds
+    for near stays near."""
     x, y = values[at], wanted[at]
     x, y, middle, level = x - x.mean(), y - y.mean(), x.mean(), y.mean()
     scale = ((x * y).sum() / x.square().sum().clamp_min(1e-20)).clamp_min(0.0)

@@ -241,10 +241,8 @@ class Detection(ClassTask):
     # ---- scores -----------------------------------------------------------------------------------------------------
 
     def loss(self, output: Sequence[Detections], truth: Place) -> Tensor:
-        """Return how far the best right box stays below `confidence`, in log-odds, (N,).
-
-        Of `create`: how far the best box where nothing is stands above it.
-        """
+        """Return how far the best right box stays below `confidence`, in log-odds, (N,). Of `create`: how far the best
+        box where nothing is stands above it."""
         wrong = self._create if self.seek == "create" else self._vanish
         return self._each(output, truth, lambda one: wrong(self._left(one), truth))
 
@@ -274,9 +272,7 @@ class Detection(ClassTask):
 
     def _displace(self, one: Detections, truth: Place) -> Tensor:
         """The lesser of two: how far the best overlap of a box that counts is under `iou`, and that some box counts.
-
-        The first is in units in which a small step from `iou` is as long as one in log-odds.
-        """
+        The first is in units in which a small step from `iou` is as long as one in log-odds."""
         scores = self._of(one, truth.labels)
         sure = log_odds(best_of(scores)) - self._bar
         away = (self.iou - best_of(overlap_with(one, truth), scores >= self.confidence)) / (self.iou * (1.0 - self.iou))

@@ -67,11 +67,9 @@ NOTHING: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
 
 
 def checked_order(text: str) -> tuple[str, ...]:
-    """Return the parts that an order names: boxes, scores and labels, and "batch" for the number of the picture.
-
-    Of one of YOLO's heads these are the words of `HEADS`, and of a layout; of DETR's one of `QUERIES`. Raises
-    ValueError: it names others.
-    """
+    """Return the parts that an order names: boxes, scores and labels, and "batch" for the number of the picture. Of one
+    of YOLO's heads these are the words of `HEADS`, and of a layout; of DETR's one of `QUERIES`. Raises ValueError: it
+    names others."""
     parts = tuple(text.replace(",", " ").split())
     if " ".join(parts) in TOLD_BY_CLASSES:
         return parts
@@ -143,11 +141,9 @@ def _queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
 
 
 def _first(returned: Any) -> tuple[Any, set[int]]:
-    """The predictions of a YOLO's output, and how many channels the maps (N, K, h, w) have that came with them.
-
-    In training form they are the first of a tuple, feature maps and prototypes of masks stand beside them, in lists and
-    mappings too. Any other output is returned as it is.
-    """
+    """The predictions of a YOLO's output, and how many channels the maps (N, K, h, w) have that came with them. In
+    training form they are the first of a tuple, feature maps and prototypes of masks stand beside them, in lists and
+    mappings too. Any other output is returned as it is."""
     if not isinstance(returned, (list, tuple)) or not returned or not isinstance(returned[0], Tensor):
         return returned, set()
     first, others = returned[0], returned[1:]
@@ -232,10 +228,8 @@ def _by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
 
 
 def _one(one: Mapping[str, Tensor]) -> Detections:
-    """The detections of one picture, checked, without rows that only fill up.
-
-    Such a row has a class or score of -1, or four equal numbers or NaN for a box, and no score.
-    """
+    """The detections of one picture, checked, without rows that only fill up. Such a row has a class or score of -1, or
+    four equal numbers or NaN for a box, and no score."""
     boxes = one["boxes"].reshape(-1, 4) if one["boxes"].numel() == 0 else one["boxes"]
     parts = [part for name, part in one.items() if name != "blank"]
     if boxes.ndim != 2 or boxes.shape[1] != 4 or any(len(part) != len(boxes) for part in parts):

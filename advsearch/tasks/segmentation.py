@@ -29,10 +29,8 @@ class Region:
     mask: Tensor
 
     def at(self, size: tuple[int, int]) -> Tensor:
-        """Return the mask at the size of an output, (h, w) bool: a pixel of which at least half is the object's.
-
-        Where none is, those that have a part of it.
-        """
+        """Return the mask at the size of an output, (h, w) bool: a pixel of which at least half is the object's. Where
+        none is, those that have a part of it."""
         if self.mask.shape == size:
             return self.mask
         shares = F.interpolate(self.mask[None, None].float(), size=size, mode="area")[0, 0]
@@ -80,10 +78,8 @@ class Segmentation(ClassTask):
         return self.names(truth.labels)
 
     def loss(self, output: Tensor, truth: Region) -> Tensor:
-        """Return, in logits (N,), the wrong classes' lead at the pixel that decides: over 0 where too few are right.
-
-        Of the object's pixels in the order of that lead it is the one at which `accuracy` of them is reached.
-        """
+        """Return, in logits (N,), the wrong classes' lead at the pixel that decides: over 0 where too few are right. Of
+        the object's pixels in the order of that lead it is the one at which `accuracy` of them is reached."""
         return self._deciding(output, truth, wrong_lead, truth.labels)
 
     def score(self, output: Tensor, truth: Region) -> Tensor:
@@ -93,10 +89,8 @@ class Segmentation(ClassTask):
         return -self._deciding(output, truth, lambda logits, labels: -target_lead(logits, labels), self.target)
 
     def pixel_margin(self, output: Tensor, truth: Region) -> Tensor:
-        """Return the mean over the object's pixels of what is sought: the lead of wrong classes, or of the target's.
-
-        In logits, (N,). Every pixel has a derivative, and not the deciding one alone as in `loss`.
-        """
+        """Return the mean over the object's pixels of what is sought: the lead of wrong classes, or of the target's. In
+        logits, (N,). Every pixel has a derivative, and not the deciding one alone as in `loss`."""
         pixels = self._pixels(output, truth)
         if pixels is None:
             return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0
@@ -134,12 +128,9 @@ class Segmentation(ClassTask):
         return found
 
     def said(self, output: Tensor, truth: Region, margins: Sequence[float]) -> list[Said]:
-        """See `Task.said`.
-
-        The prediction is the class of most of the object's pixels; a wrong one where too few are right, and "no bottle"
-        where most of these are background. Its probability is the share of the object's pixels that are right. Beside
-        it stand shares of these by class, and the overlap.
-        """
+        """See `Task.said`. The prediction is the class of most of the object's pixels; a wrong one where too few are
+        right, and "no bottle" where most of these are background. Its probability is the share of the object's pixels
+        that are right. Beside it stand shares of these by class, and the overlap."""
         found: list[Said] = []
         mask = truth.at((output.shape[2], output.shape[3])).to(output.device)
         for logits, margin in zip(output, margins, strict=True):

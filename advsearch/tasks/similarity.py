@@ -252,10 +252,8 @@ class Similarity(Classification):
         return replace(self, clean=functional.normalize(output.detach().float(), dim=1)[0]) if self.calibrates else self
 
     def read(self, returned: Any, count: int) -> Tensor:
-        """Return features (count, D): a tensor, the first of a tuple, or the first of `PARTS` that is there.
-
-        Of `last_hidden_state` that is the first token (CLS); a map is averaged over its positions.
-        """
+        """Return features (count, D): a tensor, the first of a tuple, or the first of `PARTS` that is there. Of
+        `last_hidden_state` that is the first token (CLS); a map is averaged over its positions."""
         found = pooled(returned[0] if type(returned) in (tuple, list) and returned else returned, token=True)
         if found is None or found.dim() != 2 or found.shape[0] != count:
             raise ValueError(f"expected features ({count}, D), or what has one of {', '.join(PARTS)}")
@@ -297,11 +295,9 @@ class Similarity(Classification):
         ]
 
     def _ranked(self, gallery: Gallery, features: Tensor, logits: Tensor, truth: Labels) -> list[dict[str, JsonValue]]:
-        """Say of each of N pictures where the right one stands.
-
-        Each has the `rank` of the nearest right reference among all (1 where it is the nearest of all) and its
-        `cosine`; `name_rank`, that of the right name by its logit; and the `nearest` reference of all and its cosine.
-        """
+        """Say of each of N pictures where the right one stands. Each has the `rank` of the nearest right reference
+        among all (1 where it is the nearest of all) and its `cosine`; `name_rank`, that of the right name by its logit;
+        and the `nearest` reference of all and its cosine."""
         cosines = gallery.cosines(features)
         inside = torch.isin(gallery.owners, torch.tensor(truth)).to(cosines.device)
         best = cosines[:, inside].amax(dim=1)
