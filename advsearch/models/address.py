@@ -198,8 +198,8 @@ class AskedModel:
             rows = self.scores(images)
             return torch.tensor([[max(row.get(name, 0.0), LEAST) for name in self.names] for row in rows]).log()
         answers = self._answers([(image, turn) for image in images for turn in range(self.times)])
-        shares = [answer.get("scores") or {answer["text"]: 1.0} for answer in answers]
-        texts = iter([str(max(each, key=each.get)) for each in shares])  # the likeliest name where there are scores
+        shares: list[dict[str, float]] = [answer.get("scores") or {answer["text"]: 1.0} for answer in answers]
+        texts = iter([max(each, key=each.__getitem__) for each in shares])  # the likeliest name where there are scores
         return [{"texts": list(islice(texts, self.times))} for _ in images]
 
     def scores(self, images: Sequence[Levels]) -> list[dict[str, float]]:

@@ -281,7 +281,7 @@ def _tree_problem(text: str) -> str:
         while nodes:
             node = nodes.pop()
             context = "[]" if node["context"] in (None, "null") else node["context"]
-            names = files.parse_json(context) if isinstance(context, str) else None  # they become names of arguments
+            names: Any = files.parse_json(context) if isinstance(context, str) else None  # of arguments
             plain = isinstance(names, list) and all(isinstance(name, (str, int)) for name in names)
             if node["type"] not in _CONTAINERS or not plain or any(_plain_problem(str(name)) for name in names):
                 return "has inputs or outputs in a container that is no tuple, list or dict"

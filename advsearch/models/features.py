@@ -95,7 +95,7 @@ def _last(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
         return None
 
     def read(batch: Tensor) -> Tensor:
-        value = getattr(calls(model.module, batch, last.layer)[-1], part)
+        value: Tensor = getattr(calls(model.module, batch, last.layer)[-1], part)
         channels_last = value.movedim(last.axis, -1)
         return channels_last.flatten(1, -2).mean(dim=1) if value.dim() > 2 else channels_last
 

@@ -91,9 +91,9 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
             "but gradients vanish where a probability rounds to 0 or 1: remove the final softmax if you can"
         )
     with torch.no_grad():
-        output = None if logits else _read(model, noise)
-    pixels = isinstance(output, Tensor) and output.ndim == 4 and output.shape[1] > 1  # (N, classes, h, w)
-    if pixels and _probabilities(output.movedim(1, -1).reshape(-1, output.shape[1])):
+        output: Any = None if logits else _read(model, noise)
+    maps = isinstance(output, Tensor) and output.ndim == 4 and output.shape[1] > 1  # (N, classes, h, w)
+    if maps and _probabilities(output.movedim(1, -1).flatten(0, 2)):
         warn(
             f"model {model.name} returns probabilities for each pixel: margins are differences of these and no "
             "log-odds, and gradients vanish where one rounds to 0 or 1: remove the final softmax if you can"

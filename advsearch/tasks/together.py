@@ -15,11 +15,12 @@ from torch import Tensor
 
 from advsearch.described import OUT_OF_VIEW
 from advsearch.errors import InputError
+from advsearch.files import JsonValue
 from advsearch.models import Model, Preprocessing
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.model import joined
 from advsearch.options import FROM_RUN, JOINED
-from advsearch.tasks.base import Facts, Judgement, Mark, Output, Prediction, Task, Truth, mean
+from advsearch.tasks.base import Facts, Judgement, Mark, Output, Prediction, Said, Task, Truth, mean
 from advsearch.tasks.command import Command
 
 Outputs = tuple[Any, ...]  # what each of several models returns for one picture, or one model for each picture of a rig
@@ -254,16 +255,10 @@ class EachThing(Joined):
     def predictions(self, output: Output, count: int = 1) -> list[tuple[Prediction, ...]]:
         return self.part.predictions(output, count)
 
-    def judge(self, output: Output, truth: TruthOfEach) -> list[Judgement]:
-        """See `Task.judge`: the prediction about the thing that is worst, and in the payload what is said of each."""
-        with torch.no_grad():
-            scores, margins = self.score(output, truth).tolist(), (0.0 - self.loss(output, truth)).tolist()
-        judgements = []
-        each = zip(*(self.part.judge(output, true) for true in truth.values()), strict=True)
-        for judged, score, margin in zip(each, scores, margins, strict=True):
-            if any(thing.not_a_number for thing in judged):
-                judgements.append(Judgement.of(score, math.nan, Prediction("")))
-                continue
+    def said(self, output: Output, truth: TruthOfEach, margins: Sequence[float]) -> list[Said]:
+        """See `Task.said`: the prediction about the thing that is worst, and in the payload what is said of each."""
+        found: list[Said] = []
+        for judged in zip(*(self.part.judge(output, true) for true in truth.values()), strict=True):
             by_name = dict(zip(truth, judged, strict=True))
             seen = [name for name, thing in by_name.items() if thing.prediction.label != OUT_OF_VIEW] or list(by_name)
             worst = min(seen, key=lambda name: by_name[name].margin)
@@ -277,8 +272,8 @@ class EachThing(Joined):
             }
             average = mean([thing.margin for thing in judged])
             payload = {**payloads[worst], "worst": worst, "mean_margin": average, "things": things}
-            judgements.append(Judgement.of(score, margin, by_name[worst].prediction, payload))
-        return judgements
+            found.append((by_name[worst].prediction, payload))
+        return found
 
     def marks(self, output: Output, truth: TruthOfEach) -> list[list[Mark]]:
         """See `Task.marks`: what is true of each thing, and the prediction once."""
@@ -403,10 +398,13 @@ class Rig(Joined):
         judgements = []
         for pictures, margin, score in zip(output, margins, scores, strict=True):
             each = [self.part.judge(*judged)[0] for judged in zip(pictures, truth, strict=True)]
-            kept = [{"prediction": one.prediction.label, "right": one.right, "payload": one.payload} for one in each]
             margin = math.nan if any(judged.not_a_number for judged in each) else margin
-            prediction, payload = all_said(judged.prediction for judged in each), {"pictures": kept}
-            judgements.append(Judgement.of(score, margin, prediction, payload))
+            kept: list[JsonValue] = [
+                {"prediction": judged.prediction.label, "right": judged.right, "payload": judged.payload}
+                for judged in each
+            ]
+            prediction = all_said(judged.prediction for judged in each)
+            judgements.append(Judgement.of(score, margin, prediction, {"pictures": kept}))
         return judgements
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
