@@ -60,7 +60,6 @@ class Component:
 
 @command(output.add_flags)
 def doctor(args: argparse.Namespace) -> int:
-    """Say what works."""
     print("advsearch: trying every part, a first render among them; that takes some seconds", file=sys.stderr)
     parts = diagnose()
     good = all(part.status in (OK, WARNING) for part in parts)
@@ -160,7 +159,6 @@ def other_packages(requirements: Sequence[str] | None = None) -> Component:
 
 
 def installed_version(name: str) -> str | None:
-    """The version of an installed package, or None."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -236,7 +234,6 @@ def disk(folder: Path) -> Component:
 
 
 def check_hardware() -> Component:
-    """Cores and memory."""
     cores = threads.cores()
     memory = 0  # where the system does not tell
     with suppress(AttributeError, ValueError, OSError):

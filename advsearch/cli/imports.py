@@ -29,7 +29,6 @@ Understood = tuple[dict[str, Any], list[str]]  # what is understood of a file, a
     examples=("import mug.obj", "import room.glb --json", "import room.glb --out room.png", "import box.xml --json"),
 )
 def file(args: argparse.Namespace) -> int:
-    """Say what is understood of a file."""
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
@@ -132,7 +131,6 @@ def _describe(parser: argparse.ArgumentParser) -> None:
     output.add_flags,
 )
 def threedb(args: argparse.Namespace) -> int:
-    """Make a run of what 3DB wrote."""
     from advsearch.questions.sweep.result import import_threedb  # takes seconds
 
     path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)

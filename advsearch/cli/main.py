@@ -61,7 +61,6 @@ class PlainCommand:
     examples: tuple[str, ...] = ()
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add its arguments to a parser."""
         for add in self.arguments:
             add(parser)
 
@@ -102,7 +101,6 @@ class QuestionCommand:
         return metavar, missing, more, several
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add a flag for each of the settings, and those that commands share."""
         # late, so that --help answers at once
         from advsearch.cli.flags import add_settings
         from advsearch.config import CONFIGS
@@ -211,7 +209,6 @@ def command_named(name: str) -> Any:
 
 
 def help_of(name: str) -> str:
-    """Return what a command does, in a line."""
     return COMMANDS[name].partition(" ")[2] or help_of_question(name)
 
 
@@ -227,7 +224,6 @@ class Parser(argparse.ArgumentParser):
     """argparse, but what is wrong with the arguments is an `InputError`."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise the message as an `InputError` that says where help is."""
         raise InputError(f"{message}; see {self.prog} --help")
 
 

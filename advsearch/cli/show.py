@@ -49,7 +49,6 @@ def _set_usage(parser: argparse.ArgumentParser) -> None:
     output.add_flags,
 )
 def show(args: argparse.Namespace) -> int:
-    """Show a run, or what has a name."""
     if args.picture and (args.json or len(args.what) > 1):
         raise InputError("--picture: draws the pictures of one run, after its text; give one run, and leave --json out")
     match args.what:
@@ -242,7 +241,6 @@ def _drawing() -> tuple[Callable[[Path], None] | None, str]:
 
 
 def render_text(result: RenderResult) -> str:
-    """Return what was written, and the model's predictions view by view."""
     height, width = result.size
     lines = [f"{result.out}: {width} x {height} pixels"]
     lines += [f"{result.answered}: with the predictions drawn in"] if result.answered else []
@@ -319,7 +317,6 @@ def first_doc_line(entry: Any) -> str:
     argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all"), output.add_flags
 )
 def list_all(args: argparse.Namespace) -> int:
-    """Print the names of one kind, or of all."""
     kinds = [kind for kind in REGISTRIES if kind != CASES] if args.kind == "all" else [args.kind]
     with at_work(as_json=True, quiet=False):
         names = {kind: list_names(kind) for kind in kinds}

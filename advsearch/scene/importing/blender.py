@@ -49,7 +49,6 @@ runpy.run_module("advsearch.scene.importing.usd_stage", run_name="__main__", alt
 
 
 def is_installed() -> bool:
-    """Whether `usd-core` is there."""
     return importlib.util.find_spec("pxr") is not None
 
 

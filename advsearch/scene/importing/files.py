@@ -202,7 +202,6 @@ class Notes:
         self._said[f"{self.source}{'' if clause.startswith(' ') else ': '}{clause}"] = None
 
     def has(self, kind: str, name: str) -> None:
-        """Note that the file has this, once more."""
         self._has[kind, name] += 1
 
     def take(self, kind: str, name: str) -> None:

@@ -46,7 +46,6 @@ class Entry(BaseModel):
                 level.extend(inner for inner in inside if isinstance(inner, Entry))
 
     def references(self) -> Iterator[tuple[str, int]]:
-        """Yield what this entry refers to: the kind and the number of other entries."""
         for name, value in vars(self).items():
             level: list[Any] = [value] if name in REFERENCES else []
             for held in level:
@@ -384,7 +383,6 @@ class Header(Entry):
 
     @property
     def bones(self) -> dict[int, str]:
-        """What nodes are called as bones of a person, by their numbers."""
         return {bone.node: bone.bone for bone in self.vrm_0} | {bone.node: name for name, bone in self.vrm.items()}
 
     def below(self, nodes: Iterable[int]) -> set[int]:
@@ -397,8 +395,7 @@ class Header(Entry):
 
     @property
     def parents(self) -> list[int]:
-        """The node on which each one hangs; -1 of a root."""
-        parents = [-1] * len(self.nodes)
+        parents = [-1] * len(self.nodes)  # of roots
         for number, node in enumerate(self.nodes):
             for child in node.children:
                 parents[child] = number

@@ -41,7 +41,6 @@ def poses(header: Header) -> Iterator[tuple[int, Doubles]]:
 
 
 def matrix_of(node: Node) -> Doubles:
-    """The transform (4, 4) of one node."""
     if node.matrix is not None:
         return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)
     matrix = np.eye(4)

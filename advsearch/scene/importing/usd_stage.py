@@ -168,7 +168,6 @@ class Conversion:
             yield prim
 
     def glb(self) -> bytes:
-        """Return the file."""
         unit = UsdGeom.GetStageMetersPerUnit(self.stage)
         if not 0.0 < unit < math.inf:
             raise FileFormatError(f"{self.source}: expected metersPerUnit greater than 0, got {unit}")
@@ -469,7 +468,6 @@ class Conversion:
         return files.read_bytes(Path(resolved), "a picture", LARGEST_FILE)
 
     def add_texture(self, data: bytes, sampler: Mapping[str, int]) -> int:
-        """Put a picture into the file, and return the number of its texture."""
         image = self._numbered("images", {"mimeType": mime_type(data), "bufferView": self.buffer.view(data)})
         return self._numbered("textures", {"source": image, "sampler": self._numbered("samplers", sampler)})
 
@@ -498,7 +496,6 @@ class Inputs:
         return None
 
     def value(self, name: str) -> Any:
-        """An input's own value."""
         return None if self.source(name) is not None else _produced(self.shader, name)
 
     def number(self, name: str, otherwise: float) -> float:

@@ -201,7 +201,6 @@ class Lines:
             self.kind[same & _BLANK[third if longer else second]] = number
 
     def others(self) -> Iterator[tuple[int, str, str]]:
-        """Yield the row, the keyword and the rest of each line of another kind."""
         other = (self.kind == len(KINDS)) & (self.bytes[self.starts] != _NEWLINE) & (self.bytes[self.starts] != _HASH)
         for row in np.flatnonzero(other):
             line = text_of(self.text[self.starts[row] : self.ends[row]]).strip().replace("\t", " ")

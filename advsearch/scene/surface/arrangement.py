@@ -97,7 +97,6 @@ class Light:
 
     @property
     def bytes(self) -> int:
-        """Memory."""
         return 4 * (self.on_object.numel() + self.lit.numbers)
 
     def reflected(self, fine: Tensor) -> Tensor:
@@ -200,7 +199,6 @@ class Arrangement:
 
     @property
     def bytes(self) -> int:
-        """Memory of all matrices."""
         return 8 * self.entries
 
     def look(self, cameras: Sequence[Mapping[str, Tensor]], light: Light) -> Callable[[], Seen]:
@@ -209,7 +207,6 @@ class Arrangement:
         return self._views(cameras, light.lit)
 
     def view(self, seen: Seen, number: int) -> SurfaceView:
-        """Return what one of several cameras sees."""
         return SurfaceView(seen, number, self.fine, self.sides)
 
     def finer(self, color: Tensor) -> Tensor:

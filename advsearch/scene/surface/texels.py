@@ -56,12 +56,10 @@ class LitTexels:
     begin: tuple[int, ...]  # of each grid its first texel, and the number of all
 
     def of(self, number: int) -> slice:
-        """The texels of a grid."""
         return slice(self.begin[number], self.begin[number + 1])
 
 
 def together(some: Sequence[LitTexels]) -> LitTexels:
-    """Return the texels of several surfaces as one."""
     first = np.cumsum([0] + [len(each.places) for each in some])
     cells = np.cumsum([0] + [each.grids[0].count for each in some])
     return LitTexels(
@@ -224,7 +222,6 @@ class SkyLight:
 
 
 def sky_of(padded: Tensor) -> SkyLight:
-    """Cut an environment (H, W + 2, 3) for look-ups."""
     radiance = padded[:, 1:-1].detach()
     rows, columns = radiance.shape[:2]
     polar = torch.linspace(0.0, math.pi, rows)

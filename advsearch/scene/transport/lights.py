@@ -43,7 +43,6 @@ Inputs = Mapping[str, Tensor]
 
 
 def light_inputs(renderer: Renderer) -> frozenset[str]:
-    """The inputs of a scene that are light."""
     return frozenset(name for name in renderer.scene.names if name == ENVIRONMENT or name.endswith(LAMPS))
 
 
@@ -67,7 +66,6 @@ class Lighting:
 
     @property
     def moved(self) -> frozenset[str]:
-        """The inputs that are light and move."""
         return frozenset[str]().union(*self.groups.values()) - ON_PICTURE
 
 
@@ -167,7 +165,6 @@ class Span:
         return weights
 
     def map(self, weights: Tensor) -> Tensor:
-        """Return the map (H, W, 3) of weights (k, 3)."""
         return torch.einsum("khwc,kc->hwc", self.maps, weights)
 
     @cached_property
@@ -260,7 +257,6 @@ class BasisRenderer(Predictor):
 
     @property
     def lights(self) -> int:
-        """How many there are."""
         return len(self._of_each)
 
     @property

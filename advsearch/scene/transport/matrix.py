@@ -55,7 +55,6 @@ class Halves:
         self._unpacked = None if small else self._values.float() * self._scale
 
     def __call__(self) -> Tensor:
-        """The picture, float32."""
         return self._values.float() * self._scale if self._unpacked is None else self._unpacked
 
 
@@ -116,7 +115,6 @@ class ColouredRows:
         return product.mul_(self._kept_colours().reshape(-1, 3))
 
     def transposed_times(self, values: Tensor) -> Tensor:
-        """Return the transpose times (rows, 3): (columns, 3)."""
         coloured = values * self._kept_colours().reshape(-1, 3)
         ours = self._both_ways
         return ours[1] @ coloured if ours else torch.from_numpy(self._shares().T @ coloured.numpy())
@@ -208,7 +206,6 @@ def bilinear(uv: Floats, texture: tuple[int, int]) -> tuple[npt.NDArray[np.int32
     their places in the flat texture; and their shares (n, 4)."""
 
     def both(at: Floats, count: int) -> tuple[list[npt.NDArray[np.int32]], list[Floats]]:
-        """The texels on either side, along one axis, and their shares."""
         first, share = np.floor(at).astype(np.int32), (at - np.floor(at)).astype(np.float32)
         return [first % count, (first + 1) % count], [1.0 - share, share]
 
@@ -360,7 +357,6 @@ def _collected(
 
 
 def linear_inputs(renderer: Renderer) -> frozenset[str]:
-    """The inputs of a scene to which radiance is linear."""
     return frozenset(name for name in renderer.scene.names if name.endswith(LINEAR))
 
 
