@@ -420,12 +420,10 @@ class Conversion:
             surface |= {"metallicFactor": metallic, "roughnessFactor": rough}
         else:
             surface |= {"metallicFactor": 1.0, "roughnessFactor": 1.0, "metallicRoughnessTexture": {"index": packed}}
-        normals = inputs.texture("normal", "rgb")
-        if normals is not None:
-            entry["normalTexture"] = {"index": normals}
-        glow, glowing = inputs.color("emissiveColor", (0.0, 0.0, 0.0)), inputs.texture("emissiveColor", "rgb")
-        if glowing is not None:
-            entry["emissiveTexture"] = {"index": glowing}
+        for slot, name in {"normalTexture": "normal", "emissiveTexture": "emissiveColor"}.items():
+            if (texture := inputs.texture(name, "rgb")) is not None:
+                entry[slot] = {"index": texture}
+        glow = inputs.color("emissiveColor", (0.0, 0.0, 0.0))
         if (most := max(glow)) > 0.0:
             entry["emissiveFactor"] = [channel / max(most, 1.0) for channel in glow]
             if most > 1.0:

@@ -157,21 +157,12 @@ def smoothed(ground: LitTexels, lit: Bools) -> Tensor:
     side = ground.grids[0].shape[0]
     inside = (lit if lit.any() else ~lit).reshape(side, side)
     source = _nearest(inside)
-    row, column = np.divmod(np.arange(side * side), side)
-    chosen, weights = [], []
-    for down, tall in zip(range(-2, 3), BINOMIAL, strict=True):
-        for across, wide in zip(range(-2, 3), BINOMIAL, strict=True):
-            y, x = row + down, column + across
-            there = (y >= 0) & (y < side) & (x >= 0) & (x < side)
-            at = y.clip(0, side - 1) * side + x.clip(0, side - 1)
-            chosen.append(at)
-            weights.append(tall * wide * (there & inside.ravel()[at]))
-    places, weight = np.stack(chosen, axis=1), np.stack(weights, axis=1).astype(np.float64)
-    weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
-    every = scipy.sparse.csr_matrix(
-        (weight.ravel().astype(np.float32), places.ravel(), np.arange(side * side + 1) * 25), (side * side, side * side)
+    band = scipy.sparse.diags_array(BINOMIAL, offsets=range(-2, 3), shape=(side, side), dtype=np.float64)
+    every = scipy.sparse.csr_array(
+        scipy.sparse.kron(band, band) @ scipy.sparse.diags_array(inside.ravel().astype(float))
     )
-    return by_rows(every[source])
+    every.data /= np.maximum(np.repeat(every.sum(axis=1), np.diff(every.indptr)), 1e-12)
+    return by_rows(every.astype(np.float32)[source])
 
 
 def _surface(charts: Charts, vertices: Floats, normals: Floats) -> tuple[Floats, Floats]:
