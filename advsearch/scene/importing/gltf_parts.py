@@ -50,8 +50,7 @@ EXTENSIONS = {
 }
 """What becomes of a file with an extension; of all that are not named here, nor understood, `UNKNOWN`."""
 UNKNOWN = " uses {name}, which is not understood and left out"
-FAR = 1000.0
-"""Distance of a directional light, in object sizes."""
+FAR = 1000.0  # distance of a directional light, in object sizes
 
 
 def left_out(header: Header, notes: Notes) -> None:

@@ -69,18 +69,13 @@ def product(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
     return rows
 
 
-SIDE = 160
-"""Texels a side over the searched object."""
-GATHERED = 256
-"""Rays from each texel that say what it sees."""
-BURIED = 0.3
-"""Share of a texel's rays that meet the back of a surface from which on it lies inside of something."""
+SIDE = 160  # texels a side over the searched object
+GATHERED = 256  # rays from each texel that say what it sees
+BURIED = 0.3  # share of a texel's rays that meet the back of a surface from which on it lies inside of something
 BOUNCES = 4
 """How often light goes from texel to texel: that and the camera's and the sky's segments make a path of `MAX_DEPTH`."""
-FINE = 192
-"""Least side of the grid on which base colour and light are multiplied."""
-WHITE = 0.95
-"""Reflectance that a photographed ground has at most, where light goes from surface to surface."""
+FINE = 192  # least side of the grid on which base colour and light are multiplied
+WHITE = 0.95  # reflectance that a photographed ground has at most, where light goes from surface to surface
 COLOR, MAP, GROUND = f"{OBJECT}.base_color", "environment.padded", "ground"
 CAMERAS = frozenset({"camera.to_world", "camera.fov", "camera.shift_x", "camera.shift_y"})
 FREE = CAMERAS | ON_PICTURE | {MAP, COLOR, "ground.reflectance"}

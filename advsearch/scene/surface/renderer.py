@@ -20,10 +20,8 @@ from advsearch.scene.predictor import BETWEEN, MOST_BYTES, NOISE, Predictor, dif
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light, SurfaceView
 
-MOST_RAYS = 1 << 21
-"""Rays of cameras of one launch."""
-TEXELS = 333
-"""Of an environment's map, by which it is known again."""
+MOST_RAYS = 1 << 21  # rays of cameras of one launch
+TEXELS = 333  # of an environment's map, by which it is known again
 
 
 class Look(NamedTuple):

@@ -27,16 +27,12 @@ from advsearch.scene.mitsuba_backend.texel_rays import TexelGrid
 from advsearch.scene.raster import BORDER, Charts, rasterised
 from advsearch.scene.transport.matrix import by_rows
 
-GROUND = 112
-"""Texels a side over the ground."""
-NEAR = 12.0
-"""Half the side of the ground that has texels, object sizes; further out there is the light of its border."""
+GROUND = 112  # texels a side over the ground
+NEAR = 12.0  # half the side of the ground that has texels, object sizes; further out there is the light of its border
 FINEST = 0.01
 """Side of the ground's texels under the middle of the object, object sizes: contact shadows are that sharp."""
-REACH = 2
-"""Texels to each side that the light of a place is taken from."""
-WIDTH = 0.8
-"""Standard deviation of the weight of these, texels."""
+REACH = 2  # texels to each side that the light of a place is taken from
+WIDTH = 0.8  # standard deviation of the weight of these, texels
 SAME = 1.5
 """Standard deviation of the weight of their distance in space, sides of a texel: those of another chart take no part,
 nor those of the other wall of a cup."""
@@ -183,21 +179,16 @@ def _nearest(covered: Bools) -> Ints:
     return nearest
 
 
-CELLS = (32, 64)
-"""Rows and columns of the cells of the environment."""
+CELLS = (32, 64)  # rows and columns of the cells of the environment
 WIDTHS = (math.radians(3.0), math.radians(6.0), math.radians(12.0), math.radians(24.0), math.radians(48.0))
 """By which the environment is blurred for gloss, radians."""
-BLURRED = (64, 128)
-"""Rows and columns of the blurred maps."""
-HOT = 8.0
-"""Multiples of the mean luminance above which light of the environment is found by rays of its own."""
-HOT_RAYS = 48
-"""Rays from each texel towards such light."""
+BLURRED = (64, 128)  # rows and columns of the blurred maps
+HOT = 8.0  # multiples of the mean luminance above which light of the environment is found by rays of its own
+HOT_RAYS = 48  # rays from each texel towards such light
 SPREAD = (7, 11)
 """Steps, down and across, of a lattice of so many points: 11 / 7 is 29 of 48, the golden ratio's neighbour, and both
 coordinates are even."""
-LITTLE = 0.02
-"""Share of the light up to which it is left to the cells."""
+LITTLE = 0.02  # share of the light up to which it is left to the cells
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
 
 

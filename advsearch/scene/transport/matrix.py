@@ -36,12 +36,9 @@ from advsearch.scene.parts import PATTERN
 from advsearch.scene.predictor import MOST_BYTES, LinearMap, Predictor
 from advsearch.scene.renderer import InputSpace, Renderer
 
-Smooth = Callable[[Tensor], Tensor]
-"""From a noisy picture (H, W, 3) to one without noise."""
-MOST_MEANS = 6e4
-"""Multiples of its mean up to which a picture is kept; any exposure has clipped them long before."""
-COARSE = 8
-"""Side of the cells of later vertices, in texels."""
+Smooth = Callable[[Tensor], Tensor]  # from a noisy picture (H, W, 3) to one without noise
+MOST_MEANS = 6e4  # multiples of its mean up to which a picture is kept; any exposure has clipped them long before
+COARSE = 8  # side of the cells of later vertices, in texels
 
 
 class Halves:
@@ -218,16 +215,19 @@ def bilinear(uv: Floats, texture: tuple[int, int]) -> tuple[npt.NDArray[np.int32
 SPP = 128
 """Samples a pixel of the paths whose vertices become the matrix and which make the base picture; what noise the
 denoiser leaves in it is in all predicted pictures."""
-PASS = 2**20
-"""Samples of all pixels in one pass; its vertices are held in memory."""
-MOST = 4.0
-"""Factor by which the noise of the base picture corrects a row at most."""
+PASS = 2**20  # samples of all pixels in one pass; its vertices are held in memory
+MOST = 4.0  # factor by which the noise of the base picture corrects a row at most
 TOO_LARGE = "the matrix would take more than"
 LINEAR = (".base_color", PATTERN)
 """What the names of inputs end in to which radiance is linear, but for light that meets a base colour twice."""
 
-Tick = Callable[[int], None]
-"""Told of samples a pixel as they are traced."""
+Inputs = Mapping[str, Tensor]
+SomeNames = Collection[str] | None
+Tick = Callable[[int], None]  # told of samples a pixel as they are traced
+
+
+def untold(samples: int) -> None:
+    """Tell nobody."""
 
 
 class TransportTooLargeError(Exception):
@@ -240,7 +240,7 @@ class Linearised:
 
     transports: Mapping[str, TextureTransport]  # by input, finished
     there: dict[str, Tensor]  # the inputs where it was linearised
-    applied: Mapping[str, Tensor]  # those that belong to the picture, not to the scene
+    applied: Inputs  # those that belong to the picture, not to the scene
     base: Halves  # the picture there, linear radiance, and coverage where there is a backdrop
     non_finite: int = 0
 
@@ -258,12 +258,12 @@ class LinearRenderer(Predictor):
         traced: Renderer,
         u: Tensor,
         seed: int,
-        tick: Tick = lambda samples: None,
+        tick: Tick = untold,
         *,
         spp: int = SPP,
         quick: bool = False,
-        names: Collection[str] | None = None,
-        light: Mapping[str, Tensor] = MappingProxyType({}),
+        names: SomeNames = None,
+        light: Inputs = MappingProxyType({}),
         collected: Linearised | None = None,
     ) -> None:
         super().__init__(traced)
@@ -287,28 +287,21 @@ class LinearRenderer(Predictor):
         del self.traced.scene
         self.traced.space = space
 
-    def radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
+    def radiance(self, inputs: Inputs) -> Tensor:
         base = self.collected.base()
         radiance = base[..., :3]
         for name, transport in self.collected.transports.items():
             radiance = radiance + transport(inputs[name] - self.there[name])
         return radiance if base.shape[-1] == 3 else torch.cat([radiance, base[..., 3:]], dim=-1)
 
-    def shown(self, inputs: Mapping[str, Tensor], u: Tensor) -> Tensor:
+    def shown(self, inputs: Inputs, u: Tensor) -> Tensor:
         """The picture (H, W, 3) sRGB of scene inputs, of which only those to which radiance is linear count; what
         controls do to the finished picture comes from `u`."""
         return self.traced.finished(self.radiance(inputs), self.collected.applied, u)
 
 
 def _collected(
-    renderer: Renderer,
-    u: Tensor,
-    seed: int,
-    tick: Tick,
-    spp: int,
-    quick: bool,
-    names: Collection[str] | None,
-    light: Mapping[str, Tensor],
+    renderer: Renderer, u: Tensor, seed: int, tick: Tick, spp: int, quick: bool, names: SomeNames, light: Inputs
 ) -> Linearised:
     before, (height, width) = renderer.non_finite, renderer.formation.resolution
     inputs = renderer.scene.assembly(renderer.space.inputs(u))
