@@ -246,7 +246,9 @@ class GltfSurfaces:
         self, surface: ImportedSurface, material: MaterialEntry, uvs: Sequence[Doubles]
     ) -> tuple[ImportedSurface, Doubles, Doubles]:
         places, scale, shift = np.concatenate([*uvs, np.zeros((0, 2))]), np.ones(2), np.zeros(2)
-        samplers, pictures = [self._sampler(use) for use in material.textures], list(surface.pictures)
+        uses = (material.surface.baseColorTexture, material.normalTexture, material.emissiveTexture)  # the layout first
+        samplers = [self._sampler(use) for use in uses if use is not None and material.reads(use)]
+        pictures = list(surface.pictures)
         if not pictures or not len(places) or not np.isfinite(places).all():
             return surface, scale, shift
         for axis, wraps in enumerate(([use.wrapS for use in samplers], [use.wrapT for use in samplers])):
