@@ -155,7 +155,8 @@ def finish(result: Result, text: Callable[[Any], str], *, as_json: bool) -> int:
         print_json(result)
     else:
         print(text(result) + go_on_text(result))
-    return INTERRUPTED if getattr(result, "ending", None) == "interrupted" else OK
+    stopped = getattr(result, "ending", None) == "interrupted"
+    return INTERRUPTED if stopped else OK
 
 
 def go_on_text(result: Result) -> str:
