@@ -46,19 +46,12 @@ def argument(*names: str, **options: Any) -> Argument:
 
 @dataclass(frozen=True)
 class PlainCommand:
-    """A command that asks no question.
+    """A command that asks no question."""
 
-    Attributes:
-        run: does what the arguments say, and returns the exit status.
-        arguments: what adds them, in the order in which the help shows them.
-        more: what its help says after what it does.
-        examples: lines of a shell, without `advsearch`.
-    """
-
-    run: Callable[[argparse.Namespace], int]
-    arguments: tuple[Argument, ...]
-    more: str = ""
-    examples: tuple[str, ...] = ()
+    run: Callable[[argparse.Namespace], int]  # does what the arguments say, and returns the exit status
+    arguments: tuple[Argument, ...]  # what adds them, in the order in which the help shows them
+    more: str = ""  # what its help says after what it does
+    examples: tuple[str, ...] = ()  # lines of a shell, without `advsearch`
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         for add in self.arguments:
