@@ -344,7 +344,8 @@ def labels(args: argparse.Namespace) -> int:
         if "labels" in args and args.labels is not None:
             names = read_labels(args.labels)
         else:
-            allow_named({"model": (model := getattr(args, "model", "reference"))})
+            model = getattr(args, "model", "reference")
+            allow_named({"model": model})
             loaded = load_model(model)
             if not loaded.named:
                 what = f"model {loaded.name} has {loaded.classes} classes without names"
@@ -352,9 +353,9 @@ def labels(args: argparse.Namespace) -> int:
             names = loaded.labels
         like = range(len(names)) if args.word is None else [index for index, _ in matching_labels(args.word, names)]
         asked = args.word is not None and names_nothing(args.word)
-        found = {index: names[index] for index in like if asked or not names_nothing(names[index])}
-    if not found:
+        classes = {index: names[index] for index in like if asked or not names_nothing(names[index])}
+    if not classes:
         raise InputError(f"none of the {len(names)} labels is like {args.word!r}; leave the word out to see all")
-    listed = [{"index": index, "label": name} for index, name in found.items()]
-    text = output.aligned([[f"#{index}", name] for index, name in found.items()])
+    listed = [{"index": index, "label": name} for index, name in classes.items()]
+    text = output.aligned([[f"#{index}", name] for index, name in classes.items()])
     return output.say(args.json, {"command": "labels", "word": args.word, "labels": listed}, text)
