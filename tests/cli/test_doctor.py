@@ -106,10 +106,10 @@ def test_a_process_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_llvm_tells_which_was_chosen_and_why_others_were_not(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen, other = Path("/lib/libLLVM.so.19.1"), Path("/lib/libLLVM-15.so.1")
-    candidates = [llvm.LibraryFile(chosen, (19, 1), ""), llvm.LibraryFile(other, (15,), llvm.refusal((15,)))]
+    candidates = [llvm.LibraryFile(chosen, (19, 1)), llvm.LibraryFile(other, (15,), llvm.refusal((15,)))]
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
     monkeypatch.setattr(llvm, "find", lambda: candidates)
-    monkeypatch.setattr(llvm, "ensure_llvm", lambda: llvm.LLVM(chosen, (19, 1)))
+    monkeypatch.setattr(llvm, "ensure_llvm", lambda: llvm.LibraryFile(chosen, (19, 1)))
     part = doctor.check_llvm()
     assert (part.version, part.status, part.fix) == ("19.1", doctor.OK, "")
     assert f"chosen: {chosen}" in part.detail
