@@ -51,7 +51,7 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
     materials = {name: len(faces) for name, faces in whole.mesh.materials.items()}
     width, height = whole.base_color.shape[1::-1]
     up = None if whole.up is None else whole.up.axis
-    clips, moved = ([], []) if rig is None else (list(rig.clips), list(rig.defaults))
+    clips, moved = (list(rig.clips), list(rig.defaults)) if rig is not None else ([], [])
     joints = [name.removesuffix(".x") for name in moved if name.endswith(".x")]
     targets = [name.removesuffix(".weight") for name in moved if name.endswith(".weight")]
     features = {"what it lets light through": whole.opacity, "its normal map": whole.normal_map}

@@ -141,7 +141,7 @@ def _colored(planes: Mapping[str, Plane], size: tuple[int, ...]) -> dict[str, Pl
     """Return red, green and blue from luminance, and where there is one, chroma: RY = (R - Y) / Y, and so BY."""
     if "RY" not in planes:
         return dict.fromkeys("RGB", planes["Y"])
-    y, chroma = planes["Y"].astype(np.float32), []
+    y, chroma = planes["Y"].astype(np.float32), list[Plane]()
     for plane in (planes["RY"].astype(np.float32), planes["BY"].astype(np.float32)):
         for axis in (0, 1):  # it has a value at every n-th row and column only
             last = plane.shape[axis] - 1

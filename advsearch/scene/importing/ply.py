@@ -169,7 +169,7 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     number = reader.texture_numbers(names, corner, counts)[face]
     tint = reader.colors(at, face)
     surfaces = [*reader.textures(names, plain=tint is None), ImportedSurface()]
-    parts, mapped = [], np.full((len(at), 3), -1) if uvs is None else uvs.index
+    parts, mapped = list[ImportedPart](), np.full((len(at), 3), -1) if uvs is None else uvs.index
     for chosen in alike(number, np.asarray((mapped >= 0).all(axis=1))):
         surface, colors = surfaces[number[chosen[0]]], tint
         if tint is not None and surface.texture is not None:
@@ -302,7 +302,10 @@ class _Properties:
 
     def textures(self, names: Sequence[str], *, plain: bool) -> list[ImportedSurface]:
         """Return the surface of each texture; `plain` tells that there are no colours beside them."""
-        pictures, surfaces = FilePictures(len(names), References(Path(self.notes.path)), self.notes), {}
+        pictures, surfaces = (
+            FilePictures(len(names), References(Path(self.notes.path)), self.notes),
+            dict[str, ImportedSurface](),
+        )
         instead = "neutral grey is" if plain else "the colours of its vertices or faces are"
         for name in dict.fromkeys(names):
             words = f" names the texture {{name}}, which {{why}}; {instead} used instead"
