@@ -302,10 +302,8 @@ class _Properties:
 
     def textures(self, names: Sequence[str], *, plain: bool) -> list[ImportedSurface]:
         """Return the surface of each texture; `plain` tells that there are no colours beside them."""
-        pictures, surfaces = (
-            FilePictures(len(names), References(Path(self.notes.path)), self.notes),
-            dict[str, ImportedSurface](),
-        )
+        pictures = FilePictures(len(names), References(Path(self.notes.path)), self.notes)
+        surfaces = {}
         instead = "neutral grey is" if plain else "the colours of its vertices or faces are"
         for name in dict.fromkeys(names):
             words = f" names the texture {{name}}, which {{why}}; {instead} used instead"
