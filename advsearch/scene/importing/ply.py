@@ -93,7 +93,8 @@ def _fill(notes: Notes, element: Element, cells: npt.NDArray[np.uint8], at: int,
 
     def from_any_byte(kind: np.dtype[np.generic]) -> Numbers:
         kind = np.dtype(np.float64) if text else kind
-        return np.ndarray((max(0, len(cells) - kind.itemsize + 1),), kind, cells, 0, (1,))
+        numbers: Numbers = np.ndarray((max(0, len(cells) - kind.itemsize + 1),), kind, cells, 0, (1,))
+        return numbers
 
     values = {name: from_any_byte(kind) for name, kind in element.types.items()}
     counts = {name: from_any_byte(kind) for name, kind in element.lists.items()}
@@ -169,7 +170,7 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     number = reader.texture_numbers(names, corner, counts)[face]
     tint = reader.colors(at, face)
     surfaces = [*reader.textures(names, plain=tint is None), ImportedSurface()]
-    parts, mapped = list[ImportedPart](), np.full((len(at), 3), -1) if uvs is None else uvs.index
+    parts, mapped = list[ImportedPart](), np.full((len(at), 3), -1) if uvs is None else uvs.at
     for chosen in alike(number, np.asarray((mapped >= 0).all(axis=1))):
         surface, colors = surfaces[number[chosen[0]]], tint
         if tint is not None and surface.texture is not None:

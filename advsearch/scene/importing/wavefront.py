@@ -85,13 +85,14 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
             elif not named:  # else it is said already that none could be read
                 notes.say(f" uses materials and names no material file (mtllib); {instead}")
         surface, tint = painted.surface, colors
-        if tint is not None and surface.texture is not None:
-            if tint[chosen].min() < 1.0:
+        color, tinted = surface.color, tint is not None and tint[chosen].min() < 1.0
+        if surface.texture is not None:
+            if tinted:
                 notes.say("colours of vertices are left out where there is a texture")
             tint = None
-        elif tint is not None and surface.color is None:
+        elif tint is not None and color is None:
             surface = replace(surface, color=np.ones(3, np.float32))
-        elif tint is not None and surface.color[:3].min() < 0.999 and tint[chosen].min() < 1.0:
+        elif tinted and color is not None and color[:3].min() < 0.999:
             notes.say("colours of vertices are multiplied by the Kd of their material")
         uvs = (tables["vt"] - mtl_surfaces.corner_of(number)) * painted.scale + painted.offset
         used = uvs[mapped[chosen]] if inside[first] else np.zeros(0)
