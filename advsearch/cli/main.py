@@ -46,22 +46,14 @@ def argument(*names: str, **options: Any) -> Argument:
 
 @dataclass(frozen=True)
 class PlainCommand:
-    """A command that asks no question.
+    """A command that asks no question."""
 
-    Attributes:
-        run: does what the arguments say, and returns the exit status.
-        arguments: what adds them, in the order in which the help shows them.
-        more: what its help says after what it does.
-        examples: lines of a shell, without `advsearch`.
-    """
-
-    run: Callable[[argparse.Namespace], int]
-    arguments: tuple[Argument, ...]
-    more: str = ""
-    examples: tuple[str, ...] = ()
+    run: Callable[[argparse.Namespace], int]  # does what the arguments say, and returns the exit status
+    arguments: tuple[Argument, ...]  # what adds them, in the order in which the help shows them
+    more: str = ""  # what its help says after what it does
+    examples: tuple[str, ...] = ()  # lines of a shell, without `advsearch`
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add its arguments to a parser."""
         for add in self.arguments:
             add(parser)
 
@@ -102,7 +94,6 @@ class QuestionCommand:
         return metavar, missing, more, several
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add a flag for each of the settings, and those that commands share."""
         # late, so that --help answers at once
         from advsearch.cli.flags import add_settings
         from advsearch.config import CONFIGS
@@ -211,7 +202,6 @@ def command_named(name: str) -> Any:
 
 
 def help_of(name: str) -> str:
-    """Return what a command does, in a line."""
     return COMMANDS[name].partition(" ")[2] or help_of_question(name)
 
 
@@ -227,7 +217,6 @@ class Parser(argparse.ArgumentParser):
     """argparse, but what is wrong with the arguments is an `InputError`."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise the message as an `InputError` that says where help is."""
         raise InputError(f"{message}; see {self.prog} --help")
 
 

@@ -49,7 +49,6 @@ def _set_usage(parser: argparse.ArgumentParser) -> None:
     output.add_flags,
 )
 def show(args: argparse.Namespace) -> int:
-    """Show a run, or what has a name."""
     if args.picture and (args.json or len(args.what) > 1):
         raise InputError("--picture: draws the pictures of one run, after its text; give one run, and leave --json out")
     match args.what:
@@ -242,7 +241,6 @@ def _drawing() -> tuple[Callable[[Path], None] | None, str]:
 
 
 def render_text(result: RenderResult) -> str:
-    """Return what was written, and the model's predictions view by view."""
     height, width = result.size
     lines = [f"{result.out}: {width} x {height} pixels"]
     lines += [f"{result.answered}: with the predictions drawn in"] if result.answered else []
@@ -319,7 +317,6 @@ def first_doc_line(entry: Any) -> str:
     argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all"), output.add_flags
 )
 def list_all(args: argparse.Namespace) -> int:
-    """Print the names of one kind, or of all."""
     kinds = [kind for kind in REGISTRIES if kind != CASES] if args.kind == "all" else [args.kind]
     with at_work(as_json=True, quiet=False):
         names = {kind: list_names(kind) for kind in kinds}
@@ -347,7 +344,8 @@ def labels(args: argparse.Namespace) -> int:
         if "labels" in args and args.labels is not None:
             names = read_labels(args.labels)
         else:
-            allow_named({"model": (model := getattr(args, "model", "reference"))})
+            model = getattr(args, "model", "reference")
+            allow_named({"model": model})
             loaded = load_model(model)
             if not loaded.named:
                 what = f"model {loaded.name} has {loaded.classes} classes without names"
@@ -355,9 +353,9 @@ def labels(args: argparse.Namespace) -> int:
             names = loaded.labels
         like = range(len(names)) if args.word is None else [index for index, _ in matching_labels(args.word, names)]
         asked = args.word is not None and names_nothing(args.word)
-        found = {index: names[index] for index in like if asked or not names_nothing(names[index])}
-    if not found:
+        classes = {index: names[index] for index in like if asked or not names_nothing(names[index])}
+    if not classes:
         raise InputError(f"none of the {len(names)} labels is like {args.word!r}; leave the word out to see all")
-    listed = [{"index": index, "label": name} for index, name in found.items()]
-    text = output.aligned([[f"#{index}", name] for index, name in found.items()])
+    listed = [{"index": index, "label": name} for index, name in classes.items()]
+    text = output.aligned([[f"#{index}", name] for index, name in classes.items()])
     return output.say(args.json, {"command": "labels", "word": args.word, "labels": listed}, text)

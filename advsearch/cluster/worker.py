@@ -39,13 +39,11 @@ MachineInfo = dict[str, str]
 
 @cache
 def this_machine() -> MachineInfo:
-    """Return the processor, libLLVM, and versions of packages."""
     llvm = ".".join(map(str, ensure_llvm().version))
     return {"processor": processor(), "LLVM": llvm, **{name: _version(name) for name in PACKAGES}}
 
 
 def machine_name(machine: MachineInfo) -> str:
-    """Return a short name of a machine by what it is."""
     return hashlib.sha256(json.dumps(machine, sort_keys=True).encode()).hexdigest()[:8]
 
 
@@ -100,7 +98,6 @@ class MissingError(Exception):
 
 
 def read_files(work: Work) -> Files:
-    """Read the files that the settings of a work name."""
     contents: dict[str, bytes] = {}
     for value in map(work.settings.get, work.files):
         for part in _split(value) if isinstance(value, str) else ():
@@ -163,15 +160,11 @@ _one_at_a_time = threading.Lock()
 
 
 class Ready(NamedTuple):
-    """A worker is ready."""
-
     machine: MachineInfo
     seconds: float
 
 
 class Carried(NamedTuple):
-    """A batch was carried out."""
-
     value: Any
     seconds: float
 

@@ -83,8 +83,8 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
     index, pairs = index.reshape(-1), cKDTree(points).query_pairs(WELD, output_type="ndarray")
     if len(pairs):
         cluster = connected(len(points), pairs[:, 0], pairs[:, 1])
-        _, first, merged = np.unique(cluster, return_index=True, return_inverse=True)
-        points, index = points[first], merged[index].astype(np.int64)
+        _, kept, merged = np.unique(cluster, return_index=True, return_inverse=True)
+        points, index = points[kept], merged[index].astype(np.int64)
     counts = [len(part.faces) for part in parts]
     return Soup(
         points=points,
