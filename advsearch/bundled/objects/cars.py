@@ -10,6 +10,7 @@ from collections.abc import Callable
 from itertools import pairwise, product
 
 import numpy as np
+from scipy.special import logsumexp
 
 import advsearch.bundled.objects.shapes as shapes
 from advsearch.bundled.objects.draw import Draw, hexed
@@ -38,15 +39,8 @@ def _outline(angle: Array, front: float, rear: float, half: float, power: float,
 
 
 def _shell(rows: Array, power: float, middle: float, height: Height, corner: float) -> list[Patch]:
-    """Painted patches of a stack of outlines.
-
-    Args:
-        rows: (R, 4) share of the height, half the width, front and rear end of each.
-        power: of the superellipses.
-        middle: x about which they are drawn.
-        height: from share, x and y to z.
-        corner: share of the columns from the middles of front and rear at which it is cut.
-    """
+    """Painted patches of a stack of superellipses with a power about an x: of each a share of the height, half the
+    width, front and rear end, (R, 4); they are cut at a share of the columns from the middles of front and rear."""
     # angles are equally far apart along the widest outline, symmetrical, from the rear's middle
     _, half, front, rear = rows[np.argmax(rows[:, 1])]
     fine = np.linspace(-np.pi, np.pi, 8001)
@@ -71,16 +65,14 @@ def _shell(rows: Array, power: float, middle: float, height: Height, corner: flo
 
 
 def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
-    """A smooth function through knots (x, value) in order of x."""
     curve = shapes.spline(knots, 200)
     return lambda x: np.interp(x, curve[:, 0], curve[:, 1])
 
 
 def _softest(*fields: Array) -> Array:
     """The least of some distances, with corners rounded by about 3 cm."""
-    k = 30.0
-    values: Array = -np.log(np.exp(-k * np.clip(np.stack(fields), -1.0, 1.0)).sum(axis=0)) / k
-    return values
+    softened: Array = logsumexp(-30.0 * np.clip(np.stack(fields), -1.0, 1.0), axis=0) / -30.0
+    return softened
 
 
 # ----------------------------------------------------------------------------------------------------------- body
@@ -121,7 +113,6 @@ _BODY_POWER, _CABIN_POWER = 4.2, 4.6
 
 
 def _deck(x: Array, y: Array) -> Array:
-    """The height at which the body ends and the cabin begins."""
     return np.asarray(_WAIST(x) + 0.045 * (1.0 - (y / 0.8) ** 2))
 
 
@@ -192,37 +183,31 @@ def _body_and_cabin() -> list[Patch]:
 # --------------------------------------------------------------------------------------------------------- wheels
 
 
-def _wheel() -> list[Patch]:
-    """A wheel about the z axis, its outer side up, in the middle of the tyre."""
-    half, rim = TYRE / 2, 0.212
+def _wheels() -> list[Patch]:
+    half, rim = TYRE / 2, 0.212  # about the z axis, the outer side up, in the middle of the tyre
     outside = [(rim, half - 0.008), (rim + 0.012, half), (0.29, half + 0.004), (WHEEL - 0.012, half - 0.02)]
     tread = [(WHEEL, half - 0.05), (WHEEL, 0.0), (WHEEL, 0.05 - half)]
     tyre = [*((r, -z) for r, z in outside), *tread[::-1], *outside[::-1]]
     deep = half - 0.06
-    patches = shapes.lathe([("rubber", tyre)], 28)
-    patches += shapes.lathe([("rim", [(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)])], 28)
-    patches += shapes.lathe([("well", [(rim - 0.02, deep), (0.0, deep)])], 24)
+    wheel = shapes.lathe([("rubber", tyre)], 28)
+    wheel += shapes.lathe([("rim", [(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)])], 28)
+    wheel += shapes.lathe([("well", [(rim - 0.02, deep), (0.0, deep)])], 24)
     spoke = np.array([(0.03, 0.0, half - 0.035), (0.11, 0.0, half - 0.022), (rim - 0.012, 0.0, half - 0.018)])
     section = shapes.rectangle(0.03, 0.03, 0.008, 1)
     for number, side in product(range(5), (-1.0, 1.0)):
         spoke[:, 1] = side * np.array([0.012, 0.018, 0.04])
-        patches += shapes.placed(
-            shapes.sweep("rim", spoke, section, (1.0, 1.0, 1.15)), shapes.rotation("z", 72.0 * number)
-        )
+        turn = shapes.rotation("z", 72.0 * number)
+        wheel += shapes.placed(shapes.sweep("rim", spoke, section, (1.0, 1.0, 1.15)), turn)
     hub = [(0.052, deep), (0.05, half - 0.02), (0.03, half - 0.01), (0.0, half - 0.008)]
-    return patches + shapes.lathe([("rim", shapes.rounded(hub, 0.008, 2))], 20)
-
-
-def _wheels() -> list[Patch]:
+    wheel += shapes.lathe([("rim", shapes.rounded(hub, 0.008, 2))], 20)
     patches = []
     for axle, side in WHEELS:
         turn = shapes.rotation("y", 17.0 * axle) @ shapes.rotation("x", -90.0 * side)
-        patches += shapes.placed(_wheel(), turn, (axle, side * (0.852 - TYRE / 2), WHEEL))
+        patches += shapes.placed(wheel, turn, (axle, side * (0.852 - TYRE / 2), WHEEL))
     return patches
 
 
 def _wells() -> list[Patch]:
-    """The insides of the wheel arches, and the floor."""
     angle = np.radians(np.linspace(-30.0, 210.0, 17))
     outwards = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
     patches = []
@@ -304,7 +289,6 @@ def _panes(t: Texels) -> Array:
 
 
 def _lamps(t: Texels) -> Array:
-    """A headlight: two round lamps in a bright housing."""
     _, y, z = t.xyz.T
     out = np.abs(y)
     lamp = np.minimum(np.hypot(out - 0.58, z - 0.62), np.hypot(out - 0.71, z - 0.64))
@@ -318,7 +302,6 @@ def _tail(t: Texels) -> Array:
 
 
 def _slats(t: Texels) -> Array:
-    """Dark plastic; the grilles have bright slats."""
     x, _, z = t.xyz.T
     slat = np.where((x > 1.9) & (z > 0.48), step(0.006 - np.abs((z % 0.034) - 0.017), 0.0, 0.006), 0.0)
     return mix(hexed("17181a"), hexed("8b9095"), slat)

@@ -126,40 +126,26 @@ def _exact(values: Array) -> npt.NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Instance:
-    """One member of a family before its texture is baked.
+    """One member of a family before its texture is baked."""
 
-    Attributes:
-        patches: the surface.
-        paints: a paint for every tag of the patches.
-        material: the other surface parameters.
-        detail: texels along an edge relative to the rest of the object, by tag, for parts that are hardly seen.
-        finishes: of an object of several materials, what each tag is like; its tags are then names of materials.
-        rig: what moves the vertices of all patches, in the order of the patches.
-    """
-
-    patches: Sequence[Patch]
-    paints: Mapping[str, Paint]
-    material: Material
+    patches: Sequence[Patch]  # the surface
+    paints: Mapping[str, Paint]  # a paint for every tag of the patches
+    material: Material  # the other surface parameters
+    # texels along an edge relative to the rest of the object, by tag, for parts that are hardly seen
     detail: Mapping[str, float] = field(default_factory=dict)
+    # of an object of several materials, what each tag is like; its tags are then names of materials
     finishes: Mapping[str, Material] = field(default_factory=dict)
-    rig: MeshRig | None = None
+    rig: MeshRig | None = None  # what moves the vertices of all patches, in the order of the patches
 
 
 @dataclass(frozen=True)
 class ObjectFamily:
-    """A class of objects whose members differ in proportions, texture and material.
+    """A class of objects whose members differ in proportions, texture and material."""
 
-    Attributes:
-        name: the class, usable on the command line.
-        make: builds an instance from a `Draw`.
-        metres: of the unit in which it is made.
-        texels: along each side of its texture.
-    """
-
-    name: str
-    make: Callable[[Draw], Instance]
-    metres: float
-    texels: int = SIZE
+    name: str  # the class, usable on the command line
+    make: Callable[[Draw], Instance]  # builds an instance from a `Draw`
+    metres: float  # of the unit in which it is made
+    texels: int = SIZE  # along each side of its texture
 
     @property
     def label(self) -> str:
@@ -202,13 +188,11 @@ def family(metres: float, texels: int = SIZE) -> Callable[[Callable[[Draw], Inst
     return lambda make: ObjectFamily(make.__name__.replace("_", "-"), make, metres, texels)
 
 
-def finish(
-    draw: Draw, roughness: float, clearcoat: float = 0.0, metallic: float = 0.0, spread: float = 0.2
-) -> Material:
+def finish(draw: Draw, roughness: float, clearcoat: float = 0.0, spread: float = 0.2) -> Material:
     """Return a material near the given one: roughness within `spread`, and now and then another coat."""
     rough = min(max(draw(roughness, roughness - spread, roughness + spread), 0.12), 0.95)
     coat = draw(clearcoat, 0.0, 1.0) if draw.chance(0.3) else clearcoat
-    metal = draw(metallic, 0.3, 0.8) if draw.chance(0.06) else metallic
+    metal = draw(0.0, 0.3, 0.8) if draw.chance(0.06) else 0.0
     return Material(
         roughness=round(rough, 4),
         metallic=round(metal, 4),

@@ -90,7 +90,6 @@ def chair(draw: Draw) -> Instance:
 def _chair_back(
     draw: Draw, x: float, y: float, seat: float, total: float, lean: float, leg: float, section: Array
 ) -> list[Patch]:
-    """Two leaning posts with slats between them."""
     style = draw.pick("slats", "ladder", "panel", "arch")
     patches: list[Patch] = []
     foot = seat - 2.0
@@ -143,7 +142,6 @@ def _shade(draw: Draw, low: float, high: float, wide: float, narrow: float) -> l
 
 
 def _lamp_base(draw: Draw, style: str, low: float, radius: float, stem: float) -> list[Patch]:
-    """The foot and the stem, up to the height `low`."""
     under, top = [(0.0, 0.0), (radius - 0.4, 0.0)], [(stem, low), (0.0, low)]
     if style == "disc":
         thick = draw(2.0, 1.2, 3.2)

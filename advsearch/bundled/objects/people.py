@@ -67,7 +67,6 @@ def _woven(t: Texels, color: Array, depth: float) -> Array:
 
 @painter
 def _jeans(t: Texels, color: Array) -> Array:
-    """Woven cloth with seams at the sides and the hems."""
     x, _, z = t.xyz.T
     seam = np.where((z < 0.88) & (z > 0.08), np.minimum(np.abs(x - 0.005), 9.0), 9.0)
     hem = np.abs(z - 0.085)
@@ -76,7 +75,6 @@ def _jeans(t: Texels, color: Array) -> Array:
 
 @painter
 def _face(t: Texels, color: Array, hair: Array) -> Array:
-    """Skin, redder lips and cheeks, and eyebrows."""
     x, y, z = t.xyz.T
     aside, ahead = np.abs(y), x > 0.1
     skin = np.clip(color * (1.0 + 0.1 * (noise(t.xyz * 14.0) - 0.5))[:, None], 0.0, 1.0)
@@ -97,7 +95,6 @@ def _strands(t: Texels, color: Array) -> Array:
 
 @painter
 def _leather(t: Texels, color: Array) -> Array:
-    """Shoes with a pale sole."""
     return mix(color, hexed("cfcac0"), step(0.012 - t.xyz[:, 2], 0.0, 0.004))
 
 

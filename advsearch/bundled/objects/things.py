@@ -74,7 +74,6 @@ def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
 
 @painter
 def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array:
-    """Panels between the poles, which are light."""
     angle = np.arctan2(t.xyz[:, 1], t.xyz[:, 0]) / (2 * np.pi) % 1.0
     pole = np.abs(t.xyz[:, 2]) > 0.955 * radius
     return np.where(pole[:, None], light, np.array(colors)[np.minimum((angle * 6).astype(np.int64), 5)])
@@ -82,7 +81,6 @@ def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array
 
 @painter
 def _near_to(t: Texels, seam: Callable[[Array], Array], reach: float) -> Array:
-    """1 within so far of a seam."""
     return step(-seam(shapes.unit(t.xyz)), -reach, 0.02)
 
 
@@ -234,7 +232,6 @@ def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
 
 
 def _front(draw: Draw, base: Paint, gold: Array, title: str, width: float, height: float, thick: float) -> Paint:
-    """What is stamped or printed on the front cover."""
     accent = draw.colour("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
 
     def inside(x: Array, y: Array, w: float, h: float) -> Array:

@@ -34,17 +34,8 @@ BACK = shapes.rotation("z", 220.0)  # turns the seam of a lathe away from the de
 
 
 def handle(draw: Draw, style: str, low: float, high: float, reach: float, profile: Array, inset: float) -> list[Patch]:
-    """A handle in the x-z plane, on the +x side.
-
-    Args:
-        draw: thickness of the strap.
-        style: "round", "ear" (widest at the top), "square" or "loop" (small and central).
-        low: height of its lower root.
-        high: height of its upper root.
-        reach: how far it stands out from the wall.
-        profile: (K, 2) of the wall that it stands on.
-        inset: how deep in the wall its roots are.
-    """
+    """A handle in the x-z plane, on the +x side of a wall with a profile (K, 2), that reaches so far out between the
+    heights of its roots, inset in the wall: "round", "ear" (widest at the top), "square" or "loop" (small)."""
     at_low, at_high = (shapes.at_height(profile, z) - inset for z in (low, high))
     edge = max(at_low, at_high)
     if style == "square":
@@ -203,7 +194,6 @@ def bottle(draw: Draw) -> Instance:
 
 
 def _cap(draw: Draw, radius: float, height: float) -> list[Patch]:
-    """A screw cap or crown over the mouth."""
     low, top = height - draw(1.5, 0.9, 2.2), height + 0.35
     under = np.array([[0.6 * radius, low], [radius, low]])
     side = shapes.rounded([(radius, low), (radius, top), (0.6 * radius, top)], 0.3, 4)

@@ -29,8 +29,7 @@ from advsearch.errors import AdvsearchError, EnvironmentSetupError
 from advsearch.registry import OWN_FOLDER
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
-MINIMUM = 17
-"""The first major version that renders: see the head of this file."""
+MINIMUM = 17  # the first major version that renders: see the head of this file
 
 _PATTERNS = (
     "usr/lib/*/libLLVM*.so*",

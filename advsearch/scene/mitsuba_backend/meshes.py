@@ -21,8 +21,7 @@ POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "ve
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
 
 
-LEAST = 0.2
-"""See `sampling_weights`."""
+LEAST = 0.2  # see `sampling_weights`
 
 RENDERED: Mapping[str, tuple[float, float]] = {
     "metallic": (0.0, 0.999),

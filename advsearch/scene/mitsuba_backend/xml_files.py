@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -33,26 +33,23 @@ from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, fewer_warni
 
 SUFFIX = ".xml"
 
-LARGEST = 1 << 24
-"""Bytes of a file, and of all that it includes."""
+LARGEST = 1 << 24  # bytes of a file, and of all that it includes
 MOST_ELEMENTS = 50_000
 DEEPEST = 40
 MOST_INCLUDED = 50
-LONGEST = 10_000
-"""Letters of a text with the values of its `$names`."""
+LONGEST = 10_000  # letters of a text with the values of its `$names`
 TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}
 """Elements that are not called as Mitsuba calls the type, in small letters."""
 _PLACE = re.compile(r"^\[.*?\] Error while loading string \(line (\d+), col \d+\): ", re.DOTALL)
 
 
-def read_scene(path: Path, parameters: Mapping[str, str] | None = None) -> Plugin:
-    """Return the dictionary of a scene file: plugins with their `type`, numbers, texts, transforms (4, 4); some values
-    for its `$names` go over its own defaults.
+def read_scene(path: Path) -> Plugin:
+    """Return the dictionary of a scene file: plugins with their `type`, numbers, texts, transforms (4, 4).
 
     Raises:
         FileFormatError: it is missing, damaged, too large, or no Mitsuba scene.
     """
-    text = _Text(path, References(path), dict(parameters or {}))
+    text = _Text(path, References(path))
     root = text.parsed(read_bytes(path, "scene", (SUFFIX,)))
     if root.tag != "scene":
         raise damaged(path, "a Mitsuba scene, which begins with <scene version=...>", f"<{shown(root.tag)}>")
@@ -80,12 +77,11 @@ def read_scene(path: Path, parameters: Mapping[str, str] | None = None) -> Plugi
 class _Text:
     path: Path
     references: References
-    values: dict[str, str]
+    values: dict[str, str] = field(default_factory=dict)
     size: int = 0
     elements: int = 0
     included: int = 0
-    above: int = 0
-    """Lines before the scene's first one."""
+    above: int = 0  # lines before the scene's first one
 
     def parsed(self, data: bytes) -> ElementTree.Element:
         """Return the tree of a file, comments and blanks included, so that lines stay the same."""
@@ -147,7 +143,16 @@ class _Text:
                 self.fill(child)
                 inner.append(child)
                 continue
-            included = self.other(child.get("filename", ""))
+            self.included, name = self.included + 1, child.get("filename", "")
+            if self.included > MOST_INCLUDED:
+                raise FileFormatError(
+                    f"{self.path}: includes more than {MOST_INCLUDED} files; does one include itself?"
+                )
+            try:
+                included = self.parsed(self.references.get(name))
+            except FileNotFoundError:
+                reason = next(reversed(self.references.refused.values()))
+                raise FileFormatError(f"{self.path}: includes {shown(name)}, which {reason}") from None
             if included.tag != "scene":
                 alone, included = included, ElementTree.Element("scene")
                 included.append(alone)
@@ -155,19 +160,7 @@ class _Text:
             inner += list(included)
         element[:] = inner
 
-    def other(self, name: str) -> ElementTree.Element:
-        """Return the tree of a file that is included."""
-        self.included += 1
-        if self.included > MOST_INCLUDED:
-            raise FileFormatError(f"{self.path}: includes more than {MOST_INCLUDED} files; does one include itself?")
-        try:
-            return self.parsed(self.references.get(name))
-        except FileNotFoundError:
-            reason = next(reversed(self.references.refused.values()))
-            raise FileFormatError(f"{self.path}: includes {shown(name)}, which {reason}") from None
-
     def filled(self, text: str) -> str:
-        """Return a text with the values of its `$names`."""
         whole = ""
         for at, part in enumerate(re.split(r"\$(\w+)", text)):
             if at % 2 and part not in self.values:
@@ -188,7 +181,6 @@ def _plugin(path: Path, state: Any, number: int, referred: set[str]) -> Plugin:
     last: dict[str, int] = {}
 
     def put(wanted: str, made: object) -> None:
-        """Under a name that is free: the one that is wanted, or with a number behind it."""
         name, count = wanted, last.get(wanted, 1)
         while name in entries:
             count += 1
@@ -242,7 +234,7 @@ def _plain(name: str) -> str:
     return name.replace(".", "_")
 
 
-STOCK = frozenset(
+STOCK = frozenset(  # the plugins that come with Mitsuba 3.9, but for `measured` and `merge`
     """
     aov area batch bitmap blackbody blendbsdf blendphase box bsplinecurve bumpmap catmullrom checkerboard circular
     conductor constant constvolume cube cylinder d65 depth dielectric diffuse direct directional directionalarea disk
@@ -255,7 +247,6 @@ STOCK = frozenset(
     timed_sunsky twosided uniform volpath volpathmis volume
     """.split()
 )
-"""The plugins that come with Mitsuba 3.9, but for `measured` and `merge`."""
 
 
 def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin:
