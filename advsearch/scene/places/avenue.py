@@ -84,9 +84,8 @@ def built(
     fallen, plain = Quads(), Quads()
     corners = FAR * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     plain.level((-FAR, FAR), (-FAR, FAR), -0.05, corners / 50.0)
-    walls, trees, posts = (
-        quads.swept(fallen) if snow else quads for quads in (rows.walls, _trees(plan.trees), _posts(plan.posts))
-    )
+    iron, lamps = _posts(plan.posts)
+    walls, trees, posts = (quads.swept(fallen) if snow else quads for quads in (rows.walls, _trees(plan.trees), iron))
     made = (
         (ROAD, plan.ground(), _display(paint.road, wet, snow), ground),
         ("houses", walls, _display(paint.walls), WET_WALL if wet else WALL),
@@ -95,7 +94,7 @@ def built(
         ("shops", rows.shops, _display(paint.panes), PANE),
         ("trees", trees, _leaves(), LEAF),
         ("posts", posts, grey, IRON),
-        ("street-lamps", _lamps(plan.posts), white, PANE),
+        ("street-lamps", lamps, white, PANE),
         ("plain", plain, white if snow else grass, WALL),
         *((("snow", fallen, white, WALL),) if snow else ()),
     )
@@ -266,8 +265,11 @@ def lamp_places(posts: Sequence[tuple[float, float, float]]) -> Doubles:
     return np.array([(x, lamp, KERB + LAMP_HEIGHT - 0.07) for x, _, lamp in posts])
 
 
-def _posts(posts: Sequence[tuple[float, float, float]]) -> Quads:
-    quads = Quads()
+def _posts(posts: Sequence[tuple[float, float, float]]) -> tuple[Quads, Quads]:
+    """The posts with their heads, and the areas that shine, facing down."""
+    quads, shining = Quads(), Quads()
+    half, wide = LAMP_SIZE[0] / 2 + 0.06, LAMP_SIZE[1] / 2 + 0.05
+    level = np.array([(-1, -1, 0), (-1, 1, 0), (1, 1, 0), (1, -1, 0)]) * [LAMP_SIZE[1] / 2.0, LAMP_SIZE[0] / 2.0, 0.0]
     for (x, y, z), (_, at, _) in zip(lamp_places(posts), posts, strict=True):
         foot = np.array([x, at, KERB])
         top = foot + np.array([0.0, 0.0, LAMP_HEIGHT])
@@ -275,21 +277,11 @@ def _posts(posts: Sequence[tuple[float, float, float]]) -> Quads:
         limb(quads, foot + np.array([0.0, 0.0, 1.0]), top, 0.07, 0.045, 10)
         limb(quads, top - [0.0, 0.0, 0.06], np.array([x, y, top[2] + 0.02]), 0.04, 0.03, 8)
         head = Wall((x, y, z), (0.0, -1.0 if at < y else 1.0, 0.0))
-        half, wide = LAMP_SIZE[0] / 2 + 0.06, LAMP_SIZE[1] / 2 + 0.05
-        box = np.array([[-wide, wide, -half - 0.1, half, 0.004, 0.12]])
-        quads.boxes(head, box, np.zeros((1, 4)), SHOWN)
+        quads.boxes(head, np.array([[-wide, wide, -half - 0.1, half, 0.004, 0.12]]), np.zeros((1, 4)), SHOWN)
         back = Wall((x, y, z), tuple(-np.array(head.out)))
         quads.boxes(back, np.array([[-wide, wide, 0.0, half + 0.1, 0.004, 0.12]]), np.zeros((1, 4)), (FRONT,))
-    return quads
-
-
-def _lamps(posts: Sequence[tuple[float, float, float]]) -> Quads:
-    quads, places = Quads(), lamp_places(posts)
-    half = np.array(LAMP_SIZE[::-1]) / 2.0
-    signs = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
-    corners = places[:, None] + np.concatenate([signs * half, np.zeros((4, 1))], axis=1)
-    quads.add(corners, np.zeros((len(places), 4, 2)) + 0.5)
-    return quads
+        shining.add(np.array([[(x, y, z)]]) + level, np.zeros((1, 4, 2)) + 0.5)
+    return quads, shining
 
 
 def trees_along() -> tuple[Tree, ...]:
