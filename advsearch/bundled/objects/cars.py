@@ -28,9 +28,6 @@ COLUMNS = 92
 Height = Callable[[Array, Array, Array], Array]
 
 
-# ------------------------------------------------------------------------------------------------------- outlines
-
-
 def _outline(angle: Array, front: float, rear: float, half: float, power: float, middle: float) -> tuple[Array, Array]:
     """x and y of a superellipse about (middle, 0) that reaches from `rear` to `front` and `half` to each side."""
     c, s = np.cos(angle), np.sin(angle)
@@ -74,8 +71,6 @@ def _softest(*fields: Array) -> Array:
     softened: Array = logsumexp(-30.0 * np.clip(np.stack(fields), -1.0, 1.0), axis=0) / -30.0
     return softened
 
-
-# ----------------------------------------------------------------------------------------------------------- body
 
 _BOTTOM = _line([(-2.2, 0.30), (-1.7, 0.20), (0.0, 0.175), (1.7, 0.185), (2.2, 0.235)])
 _WAIST = _line(
@@ -180,9 +175,6 @@ def _body_and_cabin() -> list[Patch]:
     return parts["body"] + parts["cabin"]
 
 
-# --------------------------------------------------------------------------------------------------------- wheels
-
-
 def _wheels() -> list[Patch]:
     half, rim = TYRE / 2, 0.212  # about the z axis, the outer side up, in the middle of the tyre
     outside = [(rim, half - 0.008), (rim + 0.012, half), (0.29, half + 0.004), (WHEEL - 0.012, half - 0.02)]
@@ -225,9 +217,6 @@ def _wells() -> list[Patch]:
     return [*patches, shapes.cap("well", np.stack([x, y, np.full_like(x, 0.2)], axis=1), np.array([0.0, 0.0, -1.0]))]
 
 
-# ------------------------------------------------------------------------------------------------------- fittings
-
-
 def _fittings() -> list[Patch]:
     patches = []
     for side in (1.0, -1.0):  # mirrors
@@ -247,9 +236,6 @@ def _fittings() -> list[Patch]:
         patches += shapes.box("paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1)
     spoiler = shapes.box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2)
     return [*patches, *shapes.placed(spoiler, shapes.rotation("y", 9.0), (-1.60, 0.0, 1.364))]
-
-
-# --------------------------------------------------------------------------------------------------------- paints
 
 
 _DOORS = (

@@ -51,8 +51,6 @@ def shade(color: Color, factor: float) -> Color:
     return np.clip(color * factor, 0.0, 1.0)
 
 
-# ------------------------------------------------------------------------------------------------------ noise
-
 _LATTICE = np.random.Generator(np.random.PCG64(20)).random((16, 16, 16))
 
 
@@ -78,9 +76,6 @@ def within(value: Array, low: float, high: float, soft: float) -> Array:
 def step(value: Array, edge: float, soft: float) -> Array:
     """Return 0 below the edge and 1 above it, with a ramp `soft` wide."""
     return np.clip((value - edge) / soft + 0.5, 0.0, 1.0)
-
-
-# ------------------------------------------------------------------------------------------------------ paints
 
 
 @painter

@@ -28,8 +28,6 @@ from advsearch.bundled.objects.textures import (
 )
 from advsearch.scene.assets import Material
 
-# -------------------------------------------------------------------------------------------------------- ball
-
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
 _SIGNS = ((a, b) for a in (-1.0, 1.0) for b in (-_GOLDEN, _GOLDEN))
 PENTAGONS = shapes.unit(np.array([corner for a, b in _SIGNS for corner in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))]))

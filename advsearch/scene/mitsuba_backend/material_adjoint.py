@@ -121,9 +121,6 @@ def material_adjoint(
     return {name: gradient for mesh in view.meshes for name, gradient in mesh.gradients().items()}
 
 
-# ---- inside the outlines --------------------------------------------------------------------------------------------
-
-
 def _interior(view: FilmView, seed: int, spp: int, tile: int) -> Any:
     with dr.suspend_grad():
         film, hit, sampler = _first_hits(view, seed, spp, tile)

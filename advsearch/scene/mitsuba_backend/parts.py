@@ -38,17 +38,14 @@ def plain_number(value: Any) -> float:
 
 
 def color(value: Any) -> Any:
-    """Three numbers: an RGB colour."""
     return mi.Color3f(*_entries(value, 3))
 
 
 def point(value: Any) -> Any:
-    """Three numbers: a place."""
     return mi.Point3f(*_entries(value, 3))
 
 
 def transform(value: Any) -> Any:
-    """A 4 x 4 matrix, row by row."""
     entries = _entries(value, 16)
     return mi.Transform4f(mi.Matrix4f([entries[4 * row : 4 * row + 4] for row in range(4)]))
 
@@ -86,11 +83,7 @@ class SceneInput:
 
 
 def key_of(parameters: Any, scene_input: SceneInput) -> str | None:
-    """Return the parameter that an input means, or None if the scene has none such.
-
-    Raises:
-        RuntimeError: there are several.
-    """
+    """Return the one parameter that an input means, or None if the scene has none such."""
     before, star, after = scene_input.key.partition("*")
     keys = [
         str(key)

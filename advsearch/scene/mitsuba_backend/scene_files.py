@@ -76,11 +76,7 @@ def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
 
 
 def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
-    """Check that numbers stand where they are read here; what else a plugin has is for Mitsuba to refuse.
-
-    Raises:
-        InputError: one is a text, a colour or the like.
-    """
+    """Check that numbers stand where they are read here; what else a plugin has is for Mitsuba to refuse."""
     for key, value in plugin.items():
         if isinstance(value, Mapping) and value.get("type", "rgb") not in ("rgb", "spectrum"):  # of whatever name
             _check_numbers(value, where if plugin["type"] != "scene" else f"{where}: {shown(key, quoted=False)}")
@@ -108,11 +104,7 @@ class PluginContents:
 
 
 def contents(path: Path) -> PluginContents:
-    """Return what is understood of a scene file.
-
-    Raises:
-        FileFormatError: as for `read_tree`.
-    """
+    """Return what is understood of a scene file; it is refused as of `read_tree`."""
     named = dict(_plugins(read_tree(path)[0]))
     kinds = {name: str(plugin["type"]) for name, plugin in named.items()}
     objects = tuple(

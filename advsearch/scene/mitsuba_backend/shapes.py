@@ -34,10 +34,7 @@ def mesh_of(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]:
     name is for errors.
 
     Where Mitsuba has a mesh, it is Mitsuba's own; round shapes become triangles here. Of a mesh with `face_normals`, or
-    without texture coordinates, every face has vertices of its own.
-
-    Raises:
-        InputError: it has none.
+    without texture coordinates, every face has vertices of its own. A shape without triangles is refused.
     """
     kind = str(shape["type"])
     if kind not in MESHES:
@@ -142,7 +139,6 @@ def _circle(share: Doubles) -> Doubles:
 
 
 def pose_of(plugin: Mapping[str, object]) -> Doubles:
-    """Return the pose (4, 4) of a plugin."""
     return np.asarray(plugin.get("to_world", np.eye(4)), dtype=np.float64)
 
 

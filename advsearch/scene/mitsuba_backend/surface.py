@@ -242,9 +242,6 @@ class Views:
         return dr.select(known, radiance, 0.0)
 
 
-# ---- look-ups -------------------------------------------------------------------------------------------------------
-
-
 def _camera(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:
     """The 16 numbers of a camera: its axes to the left, up and forward, its place, half its extent, its middle."""
     matrix = inputs["camera.to_world"].detach().double().numpy()

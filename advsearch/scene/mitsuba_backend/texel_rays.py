@@ -139,9 +139,6 @@ def seen_from_behind(scene: MitsubaScene, name: str, places: Floats) -> bool:
     return bool(behind.sum() > FROM_BEHIND * np.asarray(on.numpy()).sum())
 
 
-# ---- cut-outs -------------------------------------------------------------------------------------------------------
-
-
 def layers_of(scene: MitsubaScene) -> int:
     """How many cut-outs its rays go through; 0 where it has none."""
     return LAYERS if scene.made[0].cut_out else 0
@@ -167,9 +164,6 @@ def passed(si: Any, active: Any) -> Any:
 
 def _chance(layers: int, count: int, seed: tuple[int, ...]) -> Any:
     return mi.Float(np.random.default_rng([*seed, 1]).random(count, dtype=np.float32)) if layers else 0.5
-
-
-# ---- places ---------------------------------------------------------------------------------------------------------
 
 
 def on_grids(held: Any, grids: Sequence[TexelGrid], si: Any, way: Any) -> list[Any]:

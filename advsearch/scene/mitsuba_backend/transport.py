@@ -78,7 +78,7 @@ def collect(
     place = (corner + noise.next_2d()) / mi.Point2f(width, height)
     aperture = noise.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     ray, weight = sensor.sample_ray(0.0, 0.5, place, aperture)
-    first, emitted, bounces = _traced(scene, ray, weight, noise, depth)
+    first_hit, emitted, bounces = _traced(scene, ray, weight, noise, depth)
 
     # The same BSDFs once more, now that the base colour is larger by `STEP`: their differences are the derivatives. Or
     # the light of the projector alone, now that it throws white
@@ -109,7 +109,7 @@ def collect(
     L = dr.select(dr.isfinite(L), L, 0.0)
 
     every = dr.full(mi.Bool, True, height * width * spp)
-    channels = [*(L + emitted[0]), first.coverage, *first.background, *first.albedo, *first.normal]
+    channels = [*(L + emitted[0]), *first_hit]
     taking_part = [every & dr.any(weight != 0.0) & dr.all(dr.isfinite(weight)) for _, weight, _ in vertices]
     dr.eval(channels, vertices, taking_part)  # one kernel for the whole path
     means = [dr.block_sum(channel, spp) / spp for channel in channels]
@@ -129,21 +129,6 @@ def collect(
         places, weights = (torch.stack([axis.torch() for axis in axes], dim=1) for axes in (uv, weight))
         kept.append(Vertices(pixel.torch().long(), places, weights, sharp.torch().bool()))
     return Paths(*parts, kept)
-
-
-@dataclass
-class FirstHit:
-    """What the camera sees, by sample: the pictures of `Paths`."""
-
-    coverage: Any
-    background: Any
-    albedo: Any
-    normal: Any
-
-    def stops(self, si: Any, bsdf: Any, where: Any) -> None:
-        """Take reflectance and normal of a hit that light does not pass for those of the picture."""
-        self.albedo = dr.select(where, bsdf.eval_diffuse_reflectance(si, where), self.albedo)
-        self.normal = dr.select(where, si.sh_frame.n, self.normal)
 
 
 @dataclass(frozen=True)
@@ -186,8 +171,9 @@ class Bounce:
         return mi.Point2f(ds.uv), dr.select(seen, value * light, 0.0)
 
 
-def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[FirstHit, list[Any], list[Bounce]]:
-    """Trace paths; return what the camera sees, and from the first vertex on what each emits and, but for the last, how
+def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[list[Any], list[Any], list[Bounce]]:
+    """Trace paths; return what the camera sees, channel by
+    channel as in `Paths`, and from the first vertex on what each emits and, but for the last, how
     it reflects light. Rays of weight 0 see nothing."""
     context, count, mis_weight = mi.BSDFContext(), dr.width(ray.o), mi.ad.integrators.common.mis_weight
     active = dr.any(weight > 0.0) & dr.full(mi.Bool, True, count)
@@ -195,6 +181,14 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
     throughput = mi.Spectrum(1.0)
     cut_outs = any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf())
     straight = mi.Bool(cut_outs)  # the path has gone through cut-outs alone
+
+    albedo, normal = dr.zeros(mi.Color3f, count), dr.zeros(mi.Normal3f, count)
+
+    def stops(si: Any, bsdf: Any, where: Any) -> None:
+        """Take reflectance and normal of a hit that light does not pass for those of the picture."""
+        nonlocal albedo, normal
+        albedo = dr.select(where, bsdf.eval_diffuse_reflectance(si, where), albedo)
+        normal = dr.select(where, si.sh_frame.n, normal)
 
     # Of the vertex before: the camera counts as one that reflects in one direction alone
     prev_si, prev_pdf, prev_delta = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1.0), mi.Bool(True)
@@ -211,11 +205,10 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
         # ---- what the camera sees first; through cut-outs it sees what is behind them
         bsdf = si.bsdf(ray)
         if segment == 0:
-            covered, black = si.is_valid(), dr.zeros(mi.Color3f, count)
+            covered = si.is_valid()
             coverage, background = dr.select(covered, mi.Float(1.0), 0.0), dr.select(covered, 0.0, emitted[0])
-            first = FirstHit(coverage, background, albedo=black, normal=mi.Normal3f(black))
             if not cut_outs:
-                first.stops(si, bsdf, covered)
+                stops(si, bsdf, covered)
         active &= si.is_valid() & mi.Bool(segment + 1 < depth)
         if segment + 1 == depth:  # the last vertex takes light along, and reflects none
             break
@@ -235,7 +228,7 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
         active_bsdf = active_next & ~delta  # a mirror's value has no derivative that could be evaluated
         if cut_outs:
             through = active_next & mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
-            first.stops(si, bsdf, straight & active & ~through)
+            stops(si, bsdf, straight & active & ~through)
             straight &= through
         bsdf_weight = dr.select(active_next, bsdf_weight, 0.0)
         light = wo_em, active_em, em_weight, bsdf_value_em
@@ -247,7 +240,7 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
         sharp = sharp & delta
         prev_si, prev_pdf, prev_delta = si, bsdf_sample.pdf, delta
         ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
-    return first, emitted, bounces
+    return [coverage, *background, *albedo, *normal], emitted, bounces
 
 
 def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces:

@@ -183,9 +183,6 @@ def _ground() -> Quads:
     return quads
 
 
-# ---- trees ----------------------------------------------------------------------------------------------------------
-
-
 @lru_cache(maxsize=2)
 def _trees(places: tuple[Tree, ...]) -> Quads:
     quads = Quads()
@@ -255,9 +252,6 @@ def limb(quads: Quads, start: Doubles, end: Doubles, thick: float, thin: float, 
     normals = np.stack([ring[:-1], ring[1:], ring[1:], ring[:-1]], axis=1)
     uvs = np.broadcast_to([0.2, 0.5], (sides, 4, 2)) + np.array([0.08, 0.0]) * np.arange(sides)[:, None, None] / sides
     quads.add(corners, uvs, normals)
-
-
-# ---- lamps ----------------------------------------------------------------------------------------------------------
 
 
 def lamp_places(posts: Sequence[tuple[float, float, float]]) -> Doubles:

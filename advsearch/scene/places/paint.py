@@ -54,7 +54,6 @@ def tile_rows(high: float) -> tuple[float, float]:
 
 
 def tint(color: Color | Doubles) -> Floats:
-    """Return three numbers as an array."""
     return np.asarray(color, np.float32)
 
 
@@ -110,8 +109,6 @@ def _courses(x: Floats, z: Floats, long: float, high: float, joint: float, seed:
     return edge, tone[course % 256, number]
 
 
-# ---- windows --------------------------------------------------------------------------------------------------------
-
 PANES = 8  # kinds of panes, side by side: four of dwellings and four of shops
 
 
@@ -143,8 +140,6 @@ def panes() -> Floats:
         shown.append(color)
     return np.concatenate(shown, axis=1)
 
-
-# ---- the road -------------------------------------------------------------------------------------------------------
 
 GROUND_PERIOD, GROUND_TEXEL = 24.0, 0.03
 FRONTS = (-12.0, 15.6)  # y of the fronts of the houses on the right and on the left
@@ -197,9 +192,6 @@ def _snowed(color: Floats, y: Floats, cloud: Floats, fine: Floats) -> Floats:
     slush = (0.5 + 0.16 * cloud + 0.08 * fine)[..., None] * tint((0.98, 0.98, 1.0))
     snow = clean + driven * (slush - clean)
     return np.asarray(snow + 0.85 * wheels[..., None] * (color - snow), np.float32)
-
-
-# ---- noise ----------------------------------------------------------------------------------------------------------
 
 
 def _places(rows: int, columns: int) -> tuple[Floats, Floats]:
