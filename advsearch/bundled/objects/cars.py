@@ -68,8 +68,7 @@ def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
 
 def _softest(*fields: Array) -> Array:
     """The least of some distances, with corners rounded by about 3 cm."""
-    softened: Array = logsumexp(-30.0 * np.clip(np.stack(fields), -1.0, 1.0), axis=0) / -30.0
-    return softened
+    return np.asarray(logsumexp(-30.0 * np.clip(np.stack(fields), -1.0, 1.0), axis=0) / -30.0)
 
 
 _BOTTOM = _line([(-2.2, 0.30), (-1.7, 0.20), (0.0, 0.175), (1.7, 0.185), (2.2, 0.235)])
@@ -81,29 +80,14 @@ _WAIST = _line(
 )  # fmt: skip
 _ROOF = _line([(-2.2, 1.26), (-1.75, 1.345), (-1.3, 1.405), (-0.7, 1.435), (-0.2, 1.43), (0.2, 1.395), (1.1, 1.2)])
 _BODY = [  # share of the height, half the width, front end, rear end
-    (0.0, 0.80, 1.98, -2.0),
-    (0.03, 0.835, 2.06, -2.06),
-    (0.1, 0.86, 2.1, -2.1),
-    (0.28, 0.872, 2.135, -2.135),
-    (0.45, 0.878, 2.14, -2.14),
-    (0.62, 0.889, 2.13, -2.125),
-    (0.75, 0.898, 2.1, -2.1),
-    (0.82, 0.885, 2.06, -2.085),
-    (0.9, 0.868, 2.01, -2.065),
-    (0.96, 0.845, 1.95, -2.04),
-    (0.985, 0.82, 1.89, -2.01),
-    (1.0, 0.78, 1.79, -1.965),
-]
+    (0.0, 0.80, 1.98, -2.0), (0.03, 0.835, 2.06, -2.06), (0.1, 0.86, 2.1, -2.1), (0.28, 0.872, 2.135, -2.135),
+    (0.45, 0.878, 2.14, -2.14), (0.62, 0.889, 2.13, -2.125), (0.75, 0.898, 2.1, -2.1), (0.82, 0.885, 2.06, -2.085),
+    (0.9, 0.868, 2.01, -2.065), (0.96, 0.845, 1.95, -2.04), (0.985, 0.82, 1.89, -2.01), (1.0, 0.78, 1.79, -1.965),
+]  # fmt: skip
 _CABIN = [
-    (0.0, 0.795, 1.0, -1.955),
-    (0.25, 0.765, 0.79, -1.9),
-    (0.5, 0.732, 0.57, -1.83),
-    (0.75, 0.692, 0.34, -1.74),
-    (0.88, 0.663, 0.2, -1.66),
-    (0.95, 0.63, 0.08, -1.58),
-    (0.985, 0.58, -0.06, -1.47),
-    (1.0, 0.5, -0.22, -1.3),
-]
+    (0.0, 0.795, 1.0, -1.955), (0.25, 0.765, 0.79, -1.9), (0.5, 0.732, 0.57, -1.83), (0.75, 0.692, 0.34, -1.74),
+    (0.88, 0.663, 0.2, -1.66), (0.95, 0.63, 0.08, -1.58), (0.985, 0.58, -0.06, -1.47), (1.0, 0.5, -0.22, -1.3),
+]  # fmt: skip
 _BODY_POWER, _CABIN_POWER = 4.2, 4.6
 
 
@@ -306,16 +290,10 @@ def _plate(t: Texels, ground: Array) -> Array:
 
 GLASS = Material(roughness=0.04, specular=0.6)
 FINISHES = {
-    "paint": Material(roughness=0.38, clearcoat=1.0),
-    "glass": GLASS,
-    "headlight": GLASS,
-    "taillight": GLASS,
-    "rubber": Material(roughness=0.85),
-    "rim": Material(roughness=0.3, metallic=0.9),
-    "trim": Material(roughness=0.5),
-    "plate": Material(roughness=0.4),
-    "well": Material(roughness=0.95),
-}
+    "paint": Material(roughness=0.38, clearcoat=1.0), "glass": GLASS, "headlight": GLASS, "taillight": GLASS,
+    "rubber": Material(roughness=0.85), "rim": Material(roughness=0.3, metallic=0.9), "trim": Material(roughness=0.5),
+    "plate": Material(roughness=0.4), "well": Material(roughness=0.95),
+}  # fmt: skip
 
 
 @family(metres=1.0, texels=384)
@@ -325,15 +303,9 @@ def car(draw: Draw) -> Instance:
     patches = [*_body_and_cabin(), *_wheels(), *_wells(), *_fittings()]
     metal = draw.colour("c4c7ca", "8d9094", "2d2f31", wild=0.0)
     paints: dict[str, Paint] = {
-        "paint": _lacquer(color),
-        "glass": _panes,
-        "headlight": _lamps,
-        "taillight": _tail,
-        "rubber": solid("1c1c1d"),
-        "rim": solid(metal),
-        "trim": _slats,
-        "plate": _plate(draw.colour("f2f2ec", "f0d264", wild=0.0)),
+        "paint": _lacquer(color), "glass": _panes, "headlight": _lamps, "taillight": _tail, "rubber": solid("1c1c1d"),
+        "rim": solid(metal), "trim": _slats, "plate": _plate(draw.colour("f2f2ec", "f0d264", wild=0.0)),
         "well": solid("0a0a0b"),
-    }
+    }  # fmt: skip
     detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
     return Instance(shapes.stretched(patches, stretch), paints, FINISHES["paint"], detail, FINISHES)

@@ -96,8 +96,7 @@ def painted(
         used[area] = True
     image[~used] = np.round(image[used].mean(axis=0), 2)
     levels = np.clip(np.round(image[::-1] * 255.0, 4) + 0.5, 0.5, 255.5).astype(np.uint8)
-    stored: npt.NDArray[np.float32] = levels.astype(np.float32) / np.float32(255.0)
-    return stored
+    return np.asarray(levels.astype(np.float32) / np.float32(255.0))
 
 
 def joined(patches: Sequence[Patch], places: Sequence[AtlasPlace], side: int = SIZE) -> Mesh:

@@ -204,12 +204,7 @@ def lamp(draw: Draw) -> Instance:
     body = natural(draw, total, clouded(clay, 1.3, 4.0, offset), 0.35)
     metal = draw.colour("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
     paints = {
-        "shade": cloth,
-        "rim": solid(shade(linen, 0.8)),
-        "lining": solid("f4f0e4"),
-        "bulb": solid("fbf6e6"),
-        "body": body,
-        "foot": solid(metal),
-        "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
-    }
+        "shade": cloth, "rim": solid(shade(linen, 0.8)), "lining": solid("f4f0e4"), "bulb": solid("fbf6e6"),
+        "body": body, "foot": solid(metal), "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
+    }  # fmt: skip
     return Instance(patches, paints, finish(draw, 0.4, 0.3), {"lining": 0.6})

@@ -119,13 +119,9 @@ def teapot(draw: Draw) -> Instance:
     paint = natural(draw, height + 4.0, paint)
     trim = draw.pick(glaze, solid(second), paint)
     paints = {
-        "base": solid("a98663"),
-        "body": paint,
-        "lid": draw.pick(paint, trim),
-        "spout": draw.pick(glaze, paint),
-        "handle": draw.pick(glaze, trim),
-        "knob": solid(second) if draw.chance(0.5, True) else trim,
-    }
+        "base": solid("a98663"), "body": paint, "lid": draw.pick(paint, trim), "spout": draw.pick(glaze, paint),
+        "handle": draw.pick(glaze, trim), "knob": solid(second) if draw.chance(0.5, True) else trim,
+    }  # fmt: skip
     return Instance(patches, paints, finish(draw, 0.25, 0.7), {"base": 0.6})
 
 

@@ -69,8 +69,7 @@ def spline(points: Points, count: int) -> Array:
     """Return `count` points of the Catmull-Rom curve (chord-length knots) through (K, D) points, ends included."""
     knots = np.asarray(points, dtype=np.float64)
     at = lengths(knots)
-    curve: Array = CubicHermiteSpline(at, knots, np.gradient(knots, at, axis=0))(np.linspace(0.0, at[-1], count))
-    return curve
+    return np.asarray(CubicHermiteSpline(at, knots, np.gradient(knots, at, axis=0))(np.linspace(0.0, at[-1], count)))
 
 
 def rounded(corners: Points, radius: float | Sequence[float], steps: int = 5) -> Array:
@@ -400,8 +399,7 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
     vertices = np.concatenate([centre[None], ring])
 
     def rest(u: Array, v: Array) -> Array:
-        places: Array = centre + (u * span[0] + low[0])[:, None] * x + (v * span[1] + low[1])[:, None] * y
-        return places
+        return np.asarray(centre + (u * span[0] + low[0])[:, None] * x + (v * span[1] + low[1])[:, None] * y)
 
     size = (float(span[0]), float(span[1]))
     return Patch(tag, vertices, np.tile(normal, (len(vertices), 1)), uvs, _fan(len(ring)), size, rest)
@@ -484,8 +482,7 @@ def cropped(patch: Patch) -> Patch:
 
 def _edges(patch: Patch) -> Indices:
     pairs = np.concatenate([patch.faces[:, [0, 1]], patch.faces[:, [1, 2]], patch.faces[:, [2, 0]]])
-    edges: Indices = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
-    return edges
+    return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64))
 
 
 def _split(patch: Patch, value: Array) -> tuple[Patch, Bools]:

@@ -59,8 +59,7 @@ def noise(points: Array) -> Array:
     cell = np.floor(points)
     share = points - cell
     smooth = cell + share * share * (3.0 - 2.0 * share)
-    values: Array = map_coordinates(_LATTICE, smooth.T, order=1, mode="grid-wrap")
-    return values
+    return np.asarray(map_coordinates(_LATTICE, smooth.T, order=1, mode="grid-wrap"))
 
 
 def mix(a: Array, b: Array, weight: Array) -> Array:

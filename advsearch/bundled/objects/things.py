@@ -200,8 +200,7 @@ def book(draw: Draw) -> Instance:
 
     def pages_paint(t: Texels) -> Array:
         lines = noise(np.stack([t.xyz[:, 2] * 9.0, 0.08 * t.xyz[:, 0], 0.08 * t.xyz[:, 1]], axis=1) + offset)
-        pages: Array = paper * (0.72 + 0.28 * lines)[:, None]
-        return pages
+        return np.asarray(paper * (0.72 + 0.28 * lines)[:, None])
 
     def spine(t: Texels) -> Array:
         y = np.abs(t.xyz[:, 1]) / height
@@ -278,11 +277,9 @@ _STROKES = {  # letters in a cell 1 high and 0.6 wide: runs of points (x, y)
 
 
 FINISHES = {
-    "face": Material(roughness=0.35, clearcoat=0.4),
-    "metal": Material(roughness=0.5, metallic=0.6),
-    "post": Material(roughness=0.45, metallic=0.7),
-    "rubber": Material(roughness=0.85),
-}
+    "face": Material(roughness=0.35, clearcoat=0.4), "metal": Material(roughness=0.5, metallic=0.6),
+    "post": Material(roughness=0.45, metallic=0.7), "rubber": Material(roughness=0.85),
+}  # fmt: skip
 
 
 @painter

@@ -115,10 +115,8 @@ def mug(draw: Draw) -> Instance:
     raw = solid("a98663")
     paints = {
         "outside": over(outer, between(-1.0, 0.35, soft=0.1), raw) if draw.chance(0.4, True) else outer,
-        "inside": inner,
-        "base": raw,
-        "handle": draw.pick(glaze, outer, accent),
-    }
+        "inside": inner, "base": raw, "handle": draw.pick(glaze, outer, accent),
+    }  # fmt: skip
     patches = shapes.placed([*body, *shapes.placed(grip, shapes.rotation("z", -108.0))], BACK)
     return Instance(patches, paints, finish(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6})
 
@@ -185,11 +183,9 @@ def bottle(draw: Draw) -> Instance:
     if draw.chance(0.5, True):
         outer = over(outer, between(height * 0.8, 2 * height), speckled(solid(foil), shade(foil, 1.3), 0.5, offset))
     paints = {
-        "outside": outer,
-        "inside": solid(shade(glass, 0.6)),
-        "base": solid(glass),
+        "outside": outer, "inside": solid(shade(glass, 0.6)), "base": solid(glass),
         "cap": solid(draw.colour("c9a24b", "d0d0d0", "b5442e", "22262b")),
-    }
+    }  # fmt: skip
     return Instance(shapes.placed(patches, BACK), paints, finish(draw, 0.2, 0.6), {"inside": 0.25, "base": 0.5})
 
 

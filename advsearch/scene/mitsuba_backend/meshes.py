@@ -20,18 +20,13 @@ from advsearch.scene.parts import BASE_COLOR, MeshPart
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
 
-
 LEAST = 0.2  # see `sampling_weights`
 
-RENDERED: Mapping[str, tuple[float, float]] = {
-    "metallic": (0.0, 0.999),
-    "specular": (1e-3, 1.0),
-    "clearcoat": (1e-4, 1.0),
-}
+RENDERED = {"metallic": (0.0, 0.999), "specular": (1e-3, 1.0), "clearcoat": (1e-4, 1.0)}
 """Numbers of the principled surface that Mitsuba renders or differentiates wrongly at an end of their range: a value
 beyond is moved to the nearest of these, wherever it comes from (docs/controls/material.md)."""
 
-DARK: Mapping[str, tuple[float, float]] = {"specular": (0.0, RENDERED["specular"][0]), "eta": (1.0, 1.001)}
+DARK = {"specular": (0.0, RENDERED["specular"][0]), "eta": (1.0, 1.001)}
 """Of principled surfaces of the user's: at the first value metal would be black. Mitsuba takes the second in its place
 where the value is set later, but not where a file has it."""
 

@@ -188,23 +188,18 @@ def _point(part: parts.PointLamp) -> Translation:
 def _spot(part: parts.SpotLamp) -> Translation:
     cutoff, beam = part.cone
     lamp = {
-        "type": "spot",
-        "to_world": mi.ScalarTransform4f(part.to_world),
-        "intensity": _rgb(part.intensity),
-        "cutoff_angle": cutoff,
-        "beam_width": beam,
-    }
+        "type": "spot", "to_world": mi.ScalarTransform4f(part.to_world), "intensity": _rgb(part.intensity),
+        "cutoff_angle": cutoff, "beam_width": beam,
+    }  # fmt: skip
     return Translation({part.name: lamp}, (_light(part.name, "intensity", "intensity"),))
 
 
 @translation.register
 def _ball(part: parts.BallLamp) -> Translation:
     ball = {
-        "type": "sphere",
-        "to_world": mi.ScalarTransform4f().translate(list(part.place)).scale(part.radius),
-        "bsdf": {"type": "null"},
-        "emitter": {"type": "area", "radiance": _rgb(part.radiance)},
-    }
+        "type": "sphere", "to_world": mi.ScalarTransform4f().translate(list(part.place)).scale(part.radius),
+        "bsdf": {"type": "null"}, "emitter": {"type": "area", "radiance": _rgb(part.radiance)},
+    }  # fmt: skip
     inputs = _pose(part.name, "ball"), _light(part.name, "radiance", "emitter.radiance")
     return Translation({part.name: ball}, inputs)
 
@@ -227,13 +222,9 @@ def _beam(part: parts.BeamLamp) -> Translation:
     cosine = (1.0 + aside[None] ** 2 + (up[:, None] * height / width) ** 2) ** -0.5
     picture = (part.table * cosine**3 / np.pi)[..., None] * np.array(part.tint)
     lamp = {
-        "type": "projector",
-        "to_world": mi.ScalarTransform4f(part.to_world),
-        "fov": 90.0,
-        "fov_axis": "x",
-        "irradiance": {**meshes.texture(picture), "wrap_mode": "clamp"},
-        "sampling_weight": part.weight,
-    }
+        "type": "projector", "to_world": mi.ScalarTransform4f(part.to_world), "fov": 90.0, "fov_axis": "x",
+        "irradiance": {**meshes.texture(picture), "wrap_mode": "clamp"}, "sampling_weight": part.weight,
+    }  # fmt: skip
     return Translation({part.name: lamp}, (_pose(part.name, "to_world"),))
 
 
@@ -263,21 +254,13 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
     place = mi.ScalarTransform4f
     number = description.number
     film = {
-        "type": "hdrfilm",
-        "width": width,
-        "height": height,
-        "pixel_format": "rgba" if description.backdrop else "rgb",
-        "component_format": "float32",
-        "rfilter": {"type": filter},
-    }
+        "type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgba" if description.backdrop else "rgb",
+        "component_format": "float32", "rfilter": {"type": filter},
+    }  # fmt: skip
     camera: Plugin = {
-        **_lens(description),
-        "near_clip": 0.01,
-        "far_clip": 1e5,
-        "to_world": place(camera_to_world(description, width / height)),
-        "film": film,
-        "sampler": {"type": sampler},
-    }
+        **_lens(description), "near_clip": 0.01, "far_clip": 1e5,
+        "to_world": place(camera_to_world(description, width / height)), "film": film, "sampler": {"type": sampler},
+    }  # fmt: skip
     scene: Plugin = {"type": "scene", "camera": camera}
     if description.environment is not None:
         scene["environment"] = {
@@ -339,11 +322,9 @@ def _lens(description: SceneDescription) -> Plugin:
 
 
 CAMERA_NUMBERS = {  # what Mitsuba calls numbers of the camera, by the names of our inputs
-    "shift_x": "principal_point_offset_x",
-    "shift_y": "principal_point_offset_y",
-    "aperture": "aperture_radius",
+    "shift_x": "principal_point_offset_x", "shift_y": "principal_point_offset_y", "aperture": "aperture_radius",
     "focus": "focus_distance",
-}
+}  # fmt: skip
 
 
 def scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:

@@ -205,13 +205,9 @@ def _numbers(value: object) -> Doubles:
 # ---- The surface of a Mitsuba shape: its base colour, which is searched, and all the rest as it is ------------------
 
 COLORS = {  # surfaces with a base colour, and its name there
-    "diffuse": "reflectance",
-    "principled": "base_color",
-    "principledthin": "base_color",
-    "plastic": "diffuse_reflectance",
-    "roughplastic": "diffuse_reflectance",
-    "pplastic": "diffuse_reflectance",
-}
+    "diffuse": "reflectance", "principled": "base_color", "principledthin": "base_color",
+    "plastic": "diffuse_reflectance", "roughplastic": "diffuse_reflectance", "pplastic": "diffuse_reflectance",
+}  # fmt: skip
 GREY = 0.5  # reflectance where a surface says none: Mitsuba's default
 PLAIN_SIZE = 8  # texels of each side of a base colour that is the same everywhere
 SHARP_SIZE = 256  # smallest side of a base colour whose texels are not interpolated: smaller ones are repeated

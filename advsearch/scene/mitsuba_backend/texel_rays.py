@@ -117,8 +117,7 @@ def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) 
         active = active & (share > 0.0)
         ray = si.spawn_ray(ray.d)
     share = dr.select(scene._scene.ray_test(ray, active), 0.0, share)
-    cosines: Floats = dr.select(above, cosine * share, 0.0).numpy().reshape(len(places), len(world))
-    return cosines
+    return np.asarray(dr.select(above, cosine * share, 0.0).numpy().reshape(len(places), len(world)))
 
 
 def seen_from_behind(scene: MitsubaScene, name: str, places: Floats) -> bool:
