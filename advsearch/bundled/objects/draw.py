@@ -11,7 +11,6 @@ import numpy as np
 from advsearch.bundled.objects.shapes import Array
 
 T = TypeVar("T")
-
 Color = Array  # (3,) display-referred sRGB
 
 

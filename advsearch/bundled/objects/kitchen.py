@@ -73,11 +73,8 @@ def teapot(draw: Draw) -> Instance:
     )  # fmt: skip
     profile: list[tuple[str, Points]] = [
         ("base", [(0.0, 0.2), (foot * 0.8, 0.2), (foot * 0.86, 0.0), (foot * 0.97, 0.0)]),
-        ("body", [(foot * 0.97, 0.0), *side]),
-        ("body", rim),
-        ("lid", lid),
-        ("knob", [lid[-1], *knob]),
-    ]
+        ("body", [(foot * 0.97, 0.0), *side]), ("body", rim), ("lid", lid), ("knob", [lid[-1], *knob]),
+    ]  # fmt: skip
     body = shapes.lathe(profile, 56)
     span = draw(0.9, 0.75, 1.0)
     high, low = height * 0.84, height * (0.84 - 0.62 * span)

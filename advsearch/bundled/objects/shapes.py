@@ -123,7 +123,6 @@ def ellipse(width: float, height: float, count: int = 20) -> Array:
 
 Indices = npt.NDArray[np.int64]
 Rest = Callable[[Array, Array], Array]
-
 HARD_ANGLE = 40.0  # degrees; where two parts of a profile meet at more than this, the edge stays hard
 
 
@@ -445,9 +444,7 @@ def box(
 # edge is as smooth as the function and not as coarse as the grid.
 
 Bools = npt.NDArray[np.bool_]
-
 Field = Callable[[Array], Array]  # (N, 3) points to (N,) values, positive inside; about the distance to the edge
-
 SNAP = 0.1  # share of an edge within which a cut goes through the edge's end: thinner slivers are not worth a triangle
 
 

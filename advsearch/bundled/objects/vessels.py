@@ -295,12 +295,10 @@ def wine_glass(draw: Draw) -> Instance:
     floor = stem_top + 0.08 * deep
     edge = (inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))
     profile = [
-        ("foot", shapes.dense(under, 1.5)),
-        ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, 14)])),
-        ("bowl", np.concatenate([outer, lip, inner[:1]])),
-        ("inside", inner),
+        ("foot", shapes.dense(under, 1.5)), ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, 14)])),
+        ("bowl", np.concatenate([outer, lip, inner[:1]])), ("inside", inner),
         ("inside", np.array([inner[-1], edge, (0.0, floor)])),
-    ]
+    ]  # fmt: skip
     body = shapes.lathe(profile, 52)
     height = stem_top + deep
     tint = draw.colour("c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3)

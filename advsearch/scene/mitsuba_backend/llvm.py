@@ -30,7 +30,6 @@ from advsearch.registry import OWN_FOLDER
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MINIMUM = 17  # the first major version that renders: see the head of this file
-
 _PATTERNS = (
     "usr/lib/*/libLLVM*.so*",
     "usr/lib/libLLVM*.so*",
@@ -44,18 +43,15 @@ _PATTERNS = (
     "Program Files/LLVM/bin/LLVM-C.dll",
 )
 """Where the packages of Debian, Ubuntu, Fedora, Arch, Homebrew and LLVM's own Windows installer put the file."""
-
 _NAME = re.compile(r"libLLVM([-.]\d+(\.\d+)*)?\.(so[^/]*|dylib)|LLVM-C\.dll")
 _NAME_VERSION = re.compile(r"libLLVM(?:\.so\.|[-.])(\d\d(?:\.\d+)*)")
 _FOLDER_VERSION = re.compile(r"llvm[-@]?/?(\d\d(?:\.\d+)*)")
-
 _PROBE = (
     "import ctypes, sys\n"
     "v = [ctypes.c_uint() for _ in range(3)]\n"
     "ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*map(ctypes.byref, v))\n"
     "print(*(n.value for n in v))\n"
 )
-
 Version = tuple[int, ...]
 
 

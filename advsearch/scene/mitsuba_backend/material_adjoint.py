@@ -89,17 +89,15 @@ def material_adjoint(
     The scene is only read. Nothing is recorded with `dr.freeze`. The first call for a depth makes a path tracer.
 
     Args:
-        scene: Mitsuba's scene, loaded with `optimize=False`.
-        sensor: a perspective camera of it; a thin lens is taken for a pinhole.
-        parameters: `mi.traverse(scene)`.
+        scene, sensor, parameters: Mitsuba's scene, loaded with `optimize=False`, a perspective camera of it (a thin
+            lens is taken for a pinhole), and what `mi.traverse` says of it.
         moving: `NAME.vertices` and `NAME.normals` of each moving mesh, (V, 3) float32, world units, as the scene has
             them.
         cotangent: (H, W, 3) float32, derivative of the loss by the radiance of box-filtered pixels.
-        seed: number of the noise, at least 0.
         spp: samples a pixel of the interior term.
-        boundary_spp: samples of the outlines of each mesh, in multiples of the number of pixels; 0 leaves them out.
+        boundary_spp, shadow_spp: samples of the outlines of each mesh and of the edges that cast shadows, in multiples
+            of the number of pixels; 0 leaves them out.
         max_depth: longest light path in segments, of which only the first two move with the vertices.
-        shadow_spp: samples of the edges that cast shadows, in multiples of the number of pixels; 0 leaves them out.
 
     Returns:
         The gradients by the vertices and by the normals of each mesh, under the same names, (V, 3) float32.

@@ -19,13 +19,10 @@ from advsearch.scene.parts import BASE_COLOR, MeshPart
 
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
-
 LEAST = 0.2  # see `sampling_weights`
-
 RENDERED = {"metallic": (0.0, 0.999), "specular": (1e-3, 1.0), "clearcoat": (1e-4, 1.0)}
 """Numbers of the principled surface that Mitsuba renders or differentiates wrongly at an end of their range: a value
 beyond is moved to the nearest of these, wherever it comes from (docs/controls/material.md)."""
-
 DARK = {"specular": (0.0, RENDERED["specular"][0]), "eta": (1.0, 1.001)}
 """Of principled surfaces of the user's: at the first value metal would be black. Mitsuba takes the second in its place
 where the value is set later, but not where a file has it."""
@@ -36,13 +33,10 @@ def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
     bilinear texture of linear reflectance, and some extra entries. A clearcoat of 0 leaves the lobe out."""
     material = part.material
     surface: Plugin = {
-        "type": "principled",
-        "base_color": texture(srgb_to_linear(part.base_color)),
-        "roughness": material.roughness,
-        "metallic": rendered("metallic", material.metallic),
-        "specular": rendered("specular", material.specular),
+        "type": "principled", "base_color": texture(srgb_to_linear(part.base_color)), "roughness": material.roughness,
+        "metallic": rendered("metallic", material.metallic), "specular": rendered("specular", material.specular),
         **(extra or {}),
-    }
+    }  # fmt: skip
     if material.clearcoat > 0.0:
         surface["clearcoat"] = rendered("clearcoat", material.clearcoat)
     bsdf: Plugin = {"type": "twosided", "bsdf": surface}

@@ -61,7 +61,6 @@ def raindrops(count: int, size: float, seed: int, tangent: float) -> tuple[float
 
 
 common: Any = mi.ad.integrators.common
-
 PHASE = 1.0 / (4.0 * math.pi)  # isotropic phase function, per steradian
 NO_EXTINCTION = 1e-20
 MOST_SCATTERINGS = 8

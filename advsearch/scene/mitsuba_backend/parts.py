@@ -28,7 +28,6 @@ from advsearch.scene.mitsuba_backend.variant import Plugin, dr, fewer_warnings, 
 
 Write = Callable[[Any], Any]
 """From a Dr.Jit `TensorXf` (perhaps with gradients enabled) to the type that the Mitsuba parameter takes."""
-
 number: Write = attrgetter("array")  # a single number, or a vertex buffer, which Mitsuba takes flat
 
 

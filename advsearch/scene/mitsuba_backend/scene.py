@@ -43,10 +43,8 @@ MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
 NO_ROULETTE, ROULETTE = 1000, 2
 """Segments after which Russian roulette starts: never where paths soon leave the scene by themselves. Among houses it
 saves a third of the time without more noise; from 1 on, single gradients were a fifth off."""
-
 SHADOW_SPP = 4
 """Samples a pixel of the material form's shadow term; without it a resting object's gradient has a cosine of 0.66."""
-
 BASE_COLOR = "object.base_color"  # input: (h, w, 3) linear reflectance of the object, row 0 at v = 1 (top of the image)
 
 
@@ -411,11 +409,9 @@ class MitsubaScene:
             path = {"type": "prb", "max_depth": self.depth, "rr_depth": self.roulette, **self._path}
             projective = {"type": "prb_projective", "max_depth": self.depth, "rr_depth": NO_ROULETTE}
             recipes: dict[str, Plugin] = {
-                "path": path,
-                "hidden": {**path, "hide_emitters": True},
-                "guides": self._guides,
+                "path": path, "hidden": {**path, "hide_emitters": True}, "guides": self._guides,
                 "boundary": {**projective, "guiding": "none"},
-            }
+            }  # fmt: skip
             self._integrators[key] = mi.load_dict(recipes[method])
             population.changes += 1
         return self._integrators[key]

@@ -125,10 +125,6 @@ def _shines(plugin: Mapping[str, object]) -> bool:
     return any(inner.get("type") in LIGHTS for inner in plugins_in(plugin))
 
 
-def _letters(name: str) -> str:
-    return "".join(sign for sign in name.casefold() if sign.isalnum())
-
-
 def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedScene:
     """Read a Mitsuba scene, an XML file or a dictionary as Mitsuba's loader takes it.
 
@@ -149,7 +145,8 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     where = scene.name if isinstance(scene, Path) else "scene"
     named = dict(_plugins(tree))
     ids = [name for name, plugin in named.items() if plugin["type"] in SHAPES]
-    alike = [name for name in ids if _letters(name) == _letters(wanted)]
+    letters = {name: "".join(filter(str.isalnum, name.casefold())) for name in (*ids, wanted)}
+    alike = [name for name in ids if letters[name] == letters[wanted]]
     if wanted not in ids and len(alike) == 1:
         wanted = alike[0]
     if wanted not in ids:

@@ -16,7 +16,6 @@ from advsearch.scene.parts import BASE_COLOR, HazePart, plugins_in
 
 Buffers = tuple[Doubles, Ints, Doubles | None, Doubles | None, dict[str, Floats]]
 """Vertices, faces, normals and texture coordinates of a mesh, and its attributes, (V or F, n) by their names."""
-
 BARE = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))  # texture coordinates of a face that has none, as Mitsuba takes them
 SECTIONS = 64  # sides of a round shape
 SOLIDS = ("rectangle", "sphere", "cylinder", "disk")  # shapes of which Mitsuba has no triangles
@@ -143,12 +142,10 @@ def pose_of(plugin: Mapping[str, object]) -> Doubles:
 
 
 Plugins = Mapping[str, Mapping[str, object]]
-
 MOST, DARKEST = 2.0, 1e-3
 """Of a haze: the largest extinction per object size, and the least share of the light that is scattered."""
 OFF = 0.05
 """By what share of its radius the ball's middle may lie beside the object's; its edge is in the far background."""
-
 _OF_BALL = {"type", "id", "radius", "center", "to_world", "bsdf", "interior"}
 _OF_MEDIUM = {"type", "id", "sigma_t", "albedo", "scale", "phase"}
 

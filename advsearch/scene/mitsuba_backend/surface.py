@@ -73,15 +73,12 @@ class Seen:
 
 
 class Views:
-    """Looks through many cameras in one launch, which is recorded.
+    """Looks through many cameras of a scene in one launch, which is recorded; the inputs that it is asked with have to
+    be set in the scene.
 
-    Args:
-        scene: whose cameras and shapes these are; the inputs that it is asked with have to be set in it.
-        grids, lobes: of all surfaces that take part, those of the searched texture first.
-        widths: root mean square angles of the blurred maps, each twice the one before, radians.
-        photographed: height of the camera of a photographed ground; None where the ground is none.
-        model: the lens of all cameras; None for pinholes, which each have a field of view of their own.
-        middle: (3,) of the object, from which the blurred maps are seen.
+    Grids and lobes are those of all surfaces that take part, the searched texture's first. `widths` are the root mean
+    square angles, radians, of maps blurred as seen from the middle (3,) of the object, each twice the one before. A
+    ground is photographed from a height. A lens model is that of all cameras; pinholes each have a field of view.
     """
 
     def __init__(

@@ -22,7 +22,6 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import dr, mi, one_at_a_time
 
 Ints = npt.NDArray[np.int32]
-
 SHIFT = 1e-4  # how far from a surface rays begin, object sizes
 PASS = 1 << 20  # rays of one launch of `gather`
 LAYERS = 4  # cut-outs that a ray goes through; what comes after them is taken for opaque
@@ -55,16 +54,12 @@ def gather(
     rays: int,
     seed: int,
 ) -> Ints:
-    """Return what rays from texels see, over the cosine: (n, rays) numbers of texels; from the count of all texels on,
-    of cells of the environment; or -1, where there is no light: the back of a surface that has texels, or a shape that
-    has none.
+    """Return what rays from texels of all grids in a scene with its inputs set see, over the cosine, as numbers (n,
+    rays) of texels; from the count of all texels on, of cells of the environment, which has so many rows and columns;
+    or -1, where there is no light: the back of a surface that has texels, or a shape that has none.
 
-    Args:
-        scene: with its inputs set.
-        grids: of all surfaces.
-        cells: rows and columns of the cells of the environment.
-        places, normals: (n, 3) where texels lie, and unit shading normals.
-        rays: of each texel; the same well-spread points for all, shifted by chance, of which `seed` is the number.
+    The texels lie at places (n, 3) with unit shading normals. All have the same well-spread points, shifted by chance,
+    of which `seed` is the number.
     """
     held, to_local, layers = scene._scene, to_map(scene), layers_of(scene)
     count, texels = len(places), grids[-1].first + grids[-1].count

@@ -16,11 +16,9 @@ from advsearch import threads
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 
 VARIANT = "llvm_ad_rgb"
-
 Plugin = dict[str, Any]
 """A plugin, or a whole scene, as Mitsuba's loader takes it: its `type`, and by Mitsuba's names for them numbers, texts,
 transforms, bitmaps, objects that are loaded already, and further plugins."""
-
 one_at_a_time = threading.RLock()
 """One thread renders, builds or denoises at a time: they share what Dr.Jit records, and the denoiser's pictures."""
 

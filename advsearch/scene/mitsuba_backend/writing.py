@@ -32,7 +32,6 @@ from advsearch.scene.parts import PluginNumber
 from advsearch.scene.settings import CHANNELS
 
 NAME = "scene.xml"
-
 MATERIAL = ("roughness", "metallic", "specular", "clearcoat")
 SCATTERINGS = 3  # segments that paths in haze have beyond those between surfaces: stock Mitsuba counts both alike
 ABSENT = ("to_world", *CAMERA_NUMBERS.values())  # entries that a dictionary need not have for them to be set

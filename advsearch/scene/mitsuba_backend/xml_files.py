@@ -32,7 +32,6 @@ from advsearch.scene.mitsuba_backend.meshes import with_inner
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, fewer_warnings, mi
 
 SUFFIX = ".xml"
-
 LARGEST = 1 << 24  # bytes of a file, and of all that it includes
 MOST_ELEMENTS = 50_000
 DEEPEST = 40

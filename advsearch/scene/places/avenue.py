@@ -30,7 +30,6 @@ POSTS = tuple(range(-135, 150, 30))  # x of the lamp posts, to the right and to 
 POST_AT, TREE_AT = (-3.05, 6.55), (-4.4, 7.9)  # y of the posts and of the trees, on the right and on the left
 LAMP_HEIGHT, ARM = 7.5, 1.7
 LAMP_SIZE = (0.36, 0.22)  # of the area that shines, level
-
 WALL, PANE, LEAF, IRON = (
     Material(roughness=0.85, specular=0.25), Material(roughness=0.06, specular=0.6),
     Material(roughness=0.7, specular=0.25), Material(roughness=0.45, specular=0.5),

@@ -13,11 +13,9 @@ from advsearch.scene.assets import Doubles, Floats
 from advsearch.scene.places.quads import WETNESS, reflectance
 
 Color = tuple[float, float, float]
-
 PERIOD = 5.2  # strips repeat along this: two bays of a front
 TEXEL = 0.025
 COLUMNS = round(PERIOD / TEXEL)
-
 BAY, GROUND_FLOOR, FLOOR = 2.6, 3.9, 3.1
 HIGHEST = 17.0  # height of a strip of a front
 WALLS: tuple[tuple[str, Color, Color], ...] = (

@@ -25,7 +25,6 @@ REVEAL, LAMP = 0.16, 0.24  # how far the pane stands back, and half a side of th
 DAY, NIGHT, SHADE = 2600.0, 0.6, 4200.0
 """Luminance of the sky in the window by day and by night, and of the lamp, cd/m2."""
 USUAL = 1000.0  # luminance of a radiance of 1, cd/m2, where the light has no unit
-
 STRIP, TEXEL, COLUMNS = 0.5, 0.0125, 96
 """How high each strip of the texture is, how large a texel, and how many there are along a strip of 1.2 m."""
 LONG = TEXEL * COLUMNS
