@@ -192,9 +192,5 @@ def finish(draw: Draw, roughness: float, clearcoat: float = 0.0, spread: float =
     rough = min(max(draw(roughness, roughness - spread, roughness + spread), 0.12), 0.95)
     coat = draw(clearcoat, 0.0, 1.0) if draw.chance(0.3) else clearcoat
     metal = draw(0.0, 0.3, 0.8) if draw.chance(0.06) else 0.0
-    return Material(
-        roughness=round(rough, 4),
-        metallic=round(metal, 4),
-        specular=round(draw(0.5, 0.3, 0.7), 4),
-        clearcoat=round(coat, 4),
-    )
+    numbers = {"roughness": rough, "metallic": metal, "specular": draw(0.5, 0.3, 0.7), "clearcoat": coat}
+    return Material(**{name: round(value, 4) for name, value in numbers.items()})

@@ -52,11 +52,9 @@ def handle(draw: Draw, style: str, low: float, high: float, reach: float, profil
         curve = shapes.spline(knots, 26)
     thick, broad = draw(0.42, 0.32, 0.6), draw(0.62, 0.4, 0.95)
     flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(curve))) ** 4
-    section = (
-        shapes.ellipse(thick, broad, 16)
-        if draw.chance(0.7, True)
-        else shapes.rectangle(2 * thick, 2 * broad, 0.6 * thick)
-    )
+    section = shapes.ellipse(thick, broad, 16)
+    if not draw.chance(0.7, True):
+        section = shapes.rectangle(2 * thick, 2 * broad, 0.6 * thick)
     return shapes.sweep("handle", shapes.upright(curve), section, flare)
 
 
