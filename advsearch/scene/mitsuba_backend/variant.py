@@ -123,7 +123,6 @@ class Population:
 
     def __init__(self) -> None:
         self.changes = 0
-        self._loose: list[Any] = []
         self._held: dict[int, tuple[tuple[Any, ...], tuple[Any, ...]]] = {}
         self.unused: list[int] = []
 
@@ -140,14 +139,10 @@ class Population:
         gc.collect()  # Mitsuba's Python objects form cycles; they have to go now, not during a later render
         self.changes += 1
 
-    def keep(self, medium: Any) -> None:
-        """Hold a medium that no shape refers to for good: Mitsuba does not let go of it, and `media` has to have it."""
-        self._loose.append(medium)
-
     def media(self) -> list[Any]:
         """Return the media of all scenes: what calls one of them is recorded with all that there are, and Dr.Jit 1.5.0
         finds no others than those of the scene that is rendered."""
-        return [*self._loose, *(medium for _, media in self._held.values() for medium in media)]
+        return [medium for _, media in self._held.values() for medium in media]
 
 
 def media_in(scene: Any) -> tuple[Any, ...]:
