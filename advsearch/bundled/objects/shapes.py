@@ -143,11 +143,8 @@ def placed(
     patches: Iterable[Patch], rotation: Array | None = None, offset: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> list[Patch]:
     """Rotate patches by a (3, 3) rotation, then move them. What is painted on them moves along."""
-    turn = np.eye(3) if rotation is None else rotation
-    return [
-        replace(p, vertices=p.vertices @ turn.T + np.asarray(offset, dtype=np.float64), normals=p.normals @ turn.T)
-        for p in patches
-    ]
+    turn, move = np.eye(3) if rotation is None else rotation, np.asarray(offset, dtype=np.float64)
+    return [replace(p, vertices=p.vertices @ turn.T + move, normals=p.normals @ turn.T) for p in patches]
 
 
 def stretched(patches: Iterable[Patch], factors: Sequence[float] | Array) -> list[Patch]:

@@ -279,9 +279,7 @@ def _posts(posts: Sequence[tuple[float, float, float]]) -> tuple[Quads, Quads]:
 
 def trees_along() -> tuple[Tree, ...]:
     """Return the trees on both sides of a street, those on the left 9 m on."""
-    return tuple(
-        Tree(x + 9.0 * side, y, number, side) for side, y in enumerate(TREE_AT) for number, x in enumerate(TREES)
-    )
+    return tuple(Tree(x + 9.0 * side, y, n, side) for side, y in enumerate(TREE_AT) for n, x in enumerate(TREES))
 
 
 def posts_along(xs: Sequence[float] = POSTS) -> tuple[tuple[float, float, float], ...]:

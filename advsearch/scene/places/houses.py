@@ -13,6 +13,8 @@ from advsearch.scene.places.quads import FRONT, SHOWN, SIDES, TOP, Quads, Wall
 DEPTH = 11.0
 REVEAL, SHOP_REVEAL = 0.17, 0.32  # how far windows stand back
 ATTIC = 0.75  # of the front above the last floor
+DOOR, SHOP, WINDOW = (0.7, 1.9, 0.0, 2.75), (0.25, 2.35, 0.5, 2.95), (0.7, 1.9, 1.05, 2.85)
+"""Openings of a ground floor: from and to along its bay, and in height."""
 LIT = 0.3  # share of windows that are lit by night
 
 
@@ -40,28 +42,21 @@ class Fronts:
     def _house(self, frame: Wall, at: float, bays: int, floors: int, kind: int, rng: np.random.Generator) -> None:
         wide, high = bays * paint.BAY, paint.GROUND_FLOOR + paint.FLOOR * (floors - 1) + ATTIC
         shop, door = bool(rng.random() < 0.55), int(rng.integers(bays))
-        trim, color = (
-            int(rng.choice([paint.STONE, paint.WHITE, paint.GREY])),
-            int(rng.choice([paint.WHITE, paint.WHITE, paint.DARK, paint.GREEN])),
-        )
+        trim = int(rng.choice([paint.STONE, paint.WHITE, paint.GREY]))
+        color = int(rng.choice([paint.WHITE, paint.WHITE, paint.DARK, paint.GREEN]))
         sign = int(rng.integers(paint.RED, len(paint.TRIMS)))
         cells: list[tuple[float, ...]] = []
-        openings: list[tuple[float, ...]] = []
+        openings: list[Doubles] = []
         for floor in range(floors):
             low = 0.0 if floor == 0 else paint.GROUND_FLOOR + paint.FLOOR * (floor - 1)
             top = low + (paint.GROUND_FLOOR if floor == 0 else paint.FLOOR + ATTIC * (floor == floors - 1))
             for bay in range(bays):
                 left = at + paint.BAY * bay
                 cells.append((left, left + paint.BAY, low, top))
-                if floor == 0 and bay == door:
-                    openings.append((left + 0.7, left + 1.9, 0.0, 2.75))
-                elif floor == 0 and shop:
-                    openings.append((left + 0.25, left + 2.35, 0.5, 2.95))
-                elif floor == 0:
-                    openings.append((left + 0.7, left + 1.9, 1.05, 2.85))
-                else:
-                    tall = 1.75 if floor == 1 else 1.55
-                    openings.append((left + 0.72, left + 1.88, low + 0.8, low + 0.8 + tall))
+                opening = (0.72, 1.88, 0.8, 2.55 if floor == 1 else 2.35)
+                if floor == 0:
+                    opening = DOOR if bay == door else SHOP if shop else WINDOW
+                openings.append(np.array([left, left, low, low]) + opening)
         holes = np.array(openings)
         deep = np.where(np.arange(len(holes)) < bays, SHOP_REVEAL, REVEAL)
         self._masonry(frame, np.array(cells), holes, deep, kind)
