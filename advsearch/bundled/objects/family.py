@@ -170,16 +170,11 @@ class ObjectFamily:
             mesh = replace(mesh, materials=materials, rig=instance.rig)
         extent = np.ptp(np.concatenate([patch.vertices for patch in patches]), axis=0).max()
         return ObjectAsset(
-            name=self.name,
-            mesh=mesh,
-            base_color=painted(patches, charts, instance.paints, self.texels),
-            material=instance.material,
-            label=self.label,
-            source=BUNDLED_OBJECT,
+            name=self.name, mesh=mesh, base_color=painted(patches, charts, instance.paints, self.texels),
+            material=instance.material, label=self.label, source=BUNDLED_OBJECT,
             surface=finished(mesh, instance.finishes, instance.material) if instance.finishes else None,
-            finishes=instance.finishes,
-            metres=round(float(extent) * self.metres, 4),
-        )
+            finishes=instance.finishes, metres=round(float(extent) * self.metres, 4),
+        )  # fmt: skip
 
 
 def family(metres: float, texels: int = SIZE) -> Callable[[Callable[[Draw], Instance]], ObjectFamily]:

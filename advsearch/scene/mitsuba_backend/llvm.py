@@ -31,17 +31,11 @@ from advsearch.registry import OWN_FOLDER
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MINIMUM = 17  # the first major version that renders: see the head of this file
 _PATTERNS = (
-    "usr/lib/*/libLLVM*.so*",
-    "usr/lib/libLLVM*.so*",
-    "usr/lib/llvm*/lib/libLLVM*.so*",
-    "usr/lib64/libLLVM*.so*",
-    "usr/lib64/llvm*/lib*/libLLVM*.so*",
-    "usr/local/lib/libLLVM*.so*",
-    "opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
-    "usr/local/opt/llvm*/lib/libLLVM*.dylib",
-    "home/linuxbrew/.linuxbrew/opt/llvm*/lib/libLLVM*.so*",
+    "usr/lib/*/libLLVM*.so*", "usr/lib/libLLVM*.so*", "usr/lib/llvm*/lib/libLLVM*.so*", "usr/lib64/libLLVM*.so*",
+    "usr/lib64/llvm*/lib*/libLLVM*.so*", "usr/local/lib/libLLVM*.so*", "opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
+    "usr/local/opt/llvm*/lib/libLLVM*.dylib", "home/linuxbrew/.linuxbrew/opt/llvm*/lib/libLLVM*.so*",
     "Program Files/LLVM/bin/LLVM-C.dll",
-)
+)  # fmt: skip
 """Where the packages of Debian, Ubuntu, Fedora, Arch, Homebrew and LLVM's own Windows installer put the file."""
 _NAME = re.compile(r"libLLVM([-.]\d+(\.\d+)*)?\.(so[^/]*|dylib)|LLVM-C\.dll")
 _NAME_VERSION = re.compile(r"libLLVM(?:\.so\.|[-.])(\d\d(?:\.\d+)*)")
@@ -155,11 +149,9 @@ def install_command(release: Mapping[str, str] | None = None, system: str = sys.
     ``/etc/os-release``, None reads it."""
     sudo = "" if hasattr(os, "geteuid") and os.geteuid() == 0 else "sudo "
     commands = {
-        "Debian, Ubuntu": f"{sudo}apt-get install libllvm19",
-        "Fedora": f"{sudo}dnf install llvm-libs",
-        "Homebrew": "brew install llvm",
-        "conda": "conda install -c conda-forge libllvm19",
-    }
+        "Debian, Ubuntu": f"{sudo}apt-get install libllvm19", "Fedora": f"{sudo}dnf install llvm-libs",
+        "Homebrew": "brew install llvm", "conda": "conda install -c conda-forge libllvm19",
+    }  # fmt: skip
     if os.environ.get("CONDA_PREFIX"):
         return commands["conda"]
     if system == "darwin":

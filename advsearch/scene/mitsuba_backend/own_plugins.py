@@ -268,7 +268,6 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         self._cells = tuple(max(CELLS[0], min(CELLS[1], int(side))) for side in self.film().crop_size())
         self.pose = mi.Transform4f(super().world_transform())
         self.lens = mi.TensorXf(list(numbers), (len(NUMBERS),))
-        self.rays = mi.Float()
         self._make_rays()
         self._half = 0.0  # of the square with drops, where there are some
         if "drops" in props:

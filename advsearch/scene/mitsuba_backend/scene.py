@@ -311,18 +311,10 @@ class MitsubaScene:
 
             self._set(inputs)
             population.changes += 1  # the first call loads integrators of its own
-            names = [f"{name}.{what}" for name in meshes for what in ("vertices", "normals")]
-            return material_adjoint(
-                self._scene,
-                self._sensor,
-                self.parameters,
-                {name: inputs[name] for name in names},
-                cotangent=cotangent,
-                seed=seed,
-                spp=spp,
-                max_depth=self.depth,
-                shadow_spp=SHADOW_SPP,
-            )
+            moving = [f"{name}.{what}" for name in meshes for what in ("vertices", "normals")]
+            counts = {"seed": seed, "spp": spp, "max_depth": self.depth, "shadow_spp": SHADOW_SPP}
+            held = self._scene, self._sensor, self.parameters
+            return material_adjoint(*held, {name: inputs[name] for name in moving}, cotangent=cotangent, **counts)
 
     def transport(self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int) -> Paths:
         """Return what the vertices of light paths add to their pixels for a unit more of an input that is a base

@@ -168,16 +168,9 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     mesh = replace(mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T)  # z up
     mesh, base_color = _painted(mesh, own_uvs, surface, str(shape["type"]), where)
     made = ObjectAsset(
-        name=f"{safe_name(source)}-{clean(wanted)}",
-        mesh=normalised(mesh),
-        base_color=base_color,
-        source=str(source),
-        warnings=tuple(notes),
-        up=UpAxis("z"),
-        surface=surface.plugin,
-        emission=light,
-        extent=frame.size,
-    )
+        name=f"{safe_name(source)}-{clean(wanted)}", mesh=normalised(mesh), base_color=base_color, source=str(source),
+        warnings=tuple(notes), up=UpAxis("z"), surface=surface.plugin, emission=light, extent=frame.size,
+    )  # fmt: skip
     around: list[ScenePart] = [] if haze is None else [haze]
     cameras: dict[str, PlacedCamera] = {}
     for name, plugin in named.items():

@@ -289,11 +289,7 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
         return made
 
     return Surfaces(
-        names=tuple(shape.id() for shape in shapes),
-        id=picture(number).long(),
-        depth=picture(depth),
-        z_depth=picture(z_depth),
-        normal=torch.stack([picture(axis) for axis in normal], dim=-1),
-        uv=torch.stack([picture(axis) for axis in uv], dim=-1),
-        face=picture(face).long(),
-    )
+        names=tuple(shape.id() for shape in shapes), id=picture(number).long(), depth=picture(depth),
+        z_depth=picture(z_depth), normal=torch.stack([picture(axis) for axis in normal], dim=-1),
+        uv=torch.stack([picture(axis) for axis in uv], dim=-1), face=picture(face).long(),
+    )  # fmt: skip
