@@ -24,21 +24,11 @@ from advsearch.scene.importing.texture import textured
 from advsearch.scene.mitsuba_backend import shapes
 from advsearch.scene.mitsuba_backend.meshes import plain, with_inner
 from advsearch.scene.mitsuba_backend.variant import Plugin
-from advsearch.scene.mitsuba_backend.xml_files import read_scene, trusted
+from advsearch.scene.mitsuba_backend.xml_files import INTEGRATORS, LIGHTS, MEDIA, SENSORS, SHAPES, read_scene, trusted
 from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
 
-SHAPES = frozenset(
-    "rectangle cube sphere cylinder disk obj ply serialized instance shapegroup sdfgrid bsplinecurve linearcurve "
-    "ellipsoids ellipsoidsmesh merge".split()
-)
-LIGHTS = frozenset("constant envmap point spot directional projector sunsky timed_sunsky area directionalarea".split())
-SENSORS = frozenset("perspective thinlens orthographic radiancemeter irradiancemeter distant batch".split())
 CAMERAS = frozenset(("perspective", "thinlens"))
-INTEGRATORS = frozenset(
-    "path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov ptracer depth moment stokes".split()
-)
 NOTHING = {"type": "null"}  # the surface of what only bounds a medium
-MEDIA = frozenset(("homogeneous", "heterogeneous"))
 Y_TO_Z = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 MOST_PARTS = 2000  # plugins at the top of a scene
 DIAGONAL = math.hypot(36.0, 24.0)  # of the film of which Mitsuba's `focal_length` speaks, millimetres

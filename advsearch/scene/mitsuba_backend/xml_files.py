@@ -233,19 +233,27 @@ def _plain(name: str) -> str:
     return name.replace(".", "_")
 
 
-STOCK = frozenset(  # the plugins that come with Mitsuba 3.9, but for `measured` and `merge`
+SHAPES = frozenset(
+    "rectangle cube sphere cylinder disk obj ply serialized instance shapegroup sdfgrid bsplinecurve linearcurve "
+    "ellipsoids ellipsoidsmesh merge".split()
+)
+LIGHTS = frozenset("constant envmap point spot directional projector sunsky timed_sunsky area directionalarea".split())
+SENSORS = frozenset("perspective thinlens orthographic radiancemeter irradiancemeter distant batch".split())
+INTEGRATORS = frozenset(
+    "path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov ptracer depth moment stokes".split()
+)
+MEDIA = frozenset(("homogeneous", "heterogeneous"))
+OTHERS = frozenset(
     """
-    aov area batch bitmap blackbody blendbsdf blendphase box bsplinecurve bumpmap catmullrom checkerboard circular
-    conductor constant constvolume cube cylinder d65 depth dielectric diffuse direct directional directionalarea disk
-    distant ellipsoids ellipsoidsmesh envmap gaussian gridvolume hair hdrfilm heterogeneous hg homogeneous independent
-    instance irradiancemeter irregular isotropic lanczos ldsampler linearcurve mask mesh_attribute mitchell moment
-    multijitter normalmap null obj orthogonal orthographic path perspective plastic ply point polarizer pplastic prb
-    prb_basic prb_projective prbvolpath principled principledthin projector ptracer radiancemeter rawconstant rayleigh
-    rectangle ref regular retarder rgb roughconductor roughdielectric roughplastic scene sdfgrid serialized sggx
-    shapegroup specfilm spectrum sphere spot srgb stokes stratified sunsky tabphase tent thindielectric thinlens
-    timed_sunsky twosided uniform volpath volpathmis volume
+    bitmap blackbody blendbsdf blendphase box bumpmap catmullrom checkerboard circular conductor constvolume d65
+    dielectric diffuse gaussian gridvolume hair hdrfilm hg independent irregular isotropic lanczos ldsampler mask
+    mesh_attribute mitchell multijitter normalmap null orthogonal plastic polarizer pplastic principled principledthin
+    rawconstant rayleigh ref regular retarder rgb roughconductor roughdielectric roughplastic scene sggx specfilm
+    spectrum srgb stratified tabphase tent thindielectric twosided uniform volume
     """.split()
 )
+STOCK = (SHAPES | LIGHTS | SENSORS | INTEGRATORS | MEDIA | OTHERS) - {"merge"}
+"""The plugins that come with Mitsuba 3.9, but for `measured` and `merge`."""
 
 
 def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin:

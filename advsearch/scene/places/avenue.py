@@ -98,13 +98,11 @@ def built(
         *((("snow", fallen, white, WALL),) if snow else ()),
     )
     shine = {name: cd[None, None] / np.float32(candelas) for name, cd in LIT.items()} if dark and candelas else {}
-    return (
-        *(
-            MeshPart(name, quads.mesh(metres), base, finish, emission=shine.get(name), laid=True)
-            for name, quads, base, finish in made
-        ),
-        *plan.more(metres),
+    meshes = (
+        MeshPart(name, quads.mesh(metres), base, finish, emission=shine.get(name), laid=True)
+        for name, quads, base, finish in made
     )
+    return (*meshes, *plan.more(metres))
 
 
 @lru_cache(maxsize=8)
