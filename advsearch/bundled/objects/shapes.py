@@ -446,8 +446,7 @@ SNAP = 0.1  # share of an edge within which a cut goes through the edge's end: t
 
 
 def carved(patches: Iterable[Patch], inside: Field, tag: str | None) -> list[Patch]:
-    """Return patches, smooth and before they are placed, with what lies inside as patches of their own with a tag; None
-    leaves it out."""
+    """Return patches, smooth and not placed yet, with what lies inside under a tag of its own; None leaves it out."""
     pieces = []
     for patch in patches:
         edges, value = _edges(patch), np.array(inside(patch.vertices))

@@ -36,8 +36,7 @@ Mask = Callable[[Texels], Array]  # (N,) weights in [0, 1]
 
 
 def painter(paint: Callable[Concatenate[Texels, Options], Array]) -> Callable[Options, Paint]:
-    """Make of a function of texels and of what it paints there one of the latter alone, which returns the paint (or the
-    mask)."""
+    """Make of a function of texels and options one of the options alone, which returns the paint (or the mask)."""
 
     @wraps(paint)
     def with_options(*args: Options.args, **kwargs: Options.kwargs) -> Paint:

@@ -51,8 +51,7 @@ Version = tuple[int, ...]
 
 @dataclass(frozen=True)
 class LibraryFile:
-    """A libLLVM file, its version as numbers, major first (empty if it could not be told), and why Dr.Jit cannot use it
-    (empty if it can)."""
+    """A libLLVM file, its version, major first, or (), and why Dr.Jit cannot use it (empty if it can)."""
 
     path: Path
     version: Version
@@ -145,8 +144,7 @@ def ensure_llvm() -> LibraryFile:
 
 
 def install_command(release: Mapping[str, str] | None = None, system: str = sys.platform) -> str:
-    """The command that installs a good libLLVM on this machine, or one line for each known platform; by the entries of
-    ``/etc/os-release``, None reads it."""
+    """The command that installs a good libLLVM here, or a line for each platform; None reads ``/etc/os-release``."""
     sudo = "" if hasattr(os, "geteuid") and os.geteuid() == 0 else "sudo "
     commands = {
         "Debian, Ubuntu": f"{sudo}apt-get install libllvm19", "Fedora": f"{sudo}dnf install llvm-libs",

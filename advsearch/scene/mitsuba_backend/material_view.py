@@ -172,8 +172,7 @@ class _Sampler:
 
 
 def sampler_of(stream: int, count: int, index: Any = None) -> Any:
-    """One of `count` streams of numbers for every lane, by an index, the lane's own unless given; lanes of the same
-    index draw the same."""
+    """One of `count` streams of numbers for every lane, by an index (else its own); lanes of one index draw alike."""
     base = mi.PCG32(count, mi.UInt64(stream))
     index = dr.arange(mi.UInt32, count) if index is None else index
     sampler = _Sampler()

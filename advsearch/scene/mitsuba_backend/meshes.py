@@ -110,8 +110,7 @@ def own_surface(surface: Mapping[str, object], fill: Callable[[Mapping[str, obje
 
 
 def base_texture(base_color: Floats, options: Mapping[str, object]) -> Plugin:
-    """A base colour (h, w, 3), display-referred, as a texture of linear reflectance that is looked up as `options`
-    say."""
+    """A display-referred base colour (h, w, 3) as a texture of linear reflectance, looked up as `options` say."""
     return {**texture(srgb_to_linear(base_color)), **loadable(options)}
 
 

@@ -327,8 +327,7 @@ CAMERA_NUMBERS = {  # what Mitsuba calls numbers of the camera, by the names of 
 
 
 def scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
-    """The inputs of camera, environment and ground. Our field of view is along the larger side, Mitsuba's parameter
-    along the width."""
+    """The inputs of camera, environment and ground; our field of view is along the larger side, Mitsuba's the width."""
     height, width = resolution
 
     def along_width(value: Any) -> Any:

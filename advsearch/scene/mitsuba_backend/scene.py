@@ -142,8 +142,7 @@ class MitsubaScene:
                 self._every = {name: self.base(name) for name in sorted(self.names)}
 
     def like(self, **changes: Any) -> MitsubaScene:
-        """Return another scene made as this one was, but with another `max_depth`, `sampler`, `integrator`, or
-        `leave_out`."""
+        """Return another scene made as this one was, but for `max_depth`, `sampler`, `integrator` or `leave_out`."""
         description, filter = self.made
         settings = {"max_depth": self.max_depth, "leave_out": self._leave_out, "sampler": self.sampler, **changes}
         other = MitsubaScene(description, self.resolution, filter=filter, **settings)

@@ -33,8 +33,7 @@ LEAST = 1e-3  # share of a ray's light under which what is behind a cut-out does
 
 @dataclass(frozen=True, eq=False)
 class Lit:
-    """The light of one moment, as `Views` looks it up; flat arrays of Dr.Jit, three numbers each, and rows and columns
-    of the maps."""
+    """The light of one moment, as `Views` looks it up: flat arrays, three numbers each, and sizes of the maps."""
 
     # radiance that leaves each texel of all grids, and in the end that of the ground far off; of a photographed ground,
     # the share of the photograph that it shows

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,7 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import dr, mi, one_at_a_time
 
 Ints = npt.NDArray[np.int32]
+Grids: TypeAlias = "Sequence[TexelGrid]"
 SHIFT = 1e-4  # how far from a surface rays begin, object sizes
 PASS = 1 << 20  # rays of one launch of `gather`
 LAYERS = 4  # cut-outs that a ray goes through; what comes after them is taken for opaque
@@ -46,13 +47,7 @@ class TexelGrid:
 
 
 def gather(
-    scene: MitsubaScene,
-    grids: Sequence[TexelGrid],
-    cells: tuple[int, int],
-    places: Floats,
-    normals: Floats,
-    rays: int,
-    seed: int,
+    scene: MitsubaScene, grids: Grids, cells: tuple[int, int], places: Floats, normals: Floats, rays: int, seed: int
 ) -> Ints:
     """Return what rays from texels of all grids in a scene with its inputs set see, over the cosine, as numbers (n,
     rays) of texels; from the count of all texels on, of cells of the environment, which has so many rows and columns;
@@ -116,8 +111,7 @@ def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) 
 
 
 def seen_from_behind(scene: MitsubaScene, name: str, places: Floats) -> bool:
-    """Whether backs of the faces of a shape, with places (n, 3) on it, are seen from outside, as through an open
-    window."""
+    """Whether backs of the faces of a shape, with places (n, 3) on it, are seen from outside, as through a window."""
     generator = np.random.default_rng(0)
     ways = generator.standard_normal((PASS >> 7, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -160,7 +154,7 @@ def _chance(layers: int, count: int, seed: tuple[int, ...]) -> Any:
     return mi.Float(np.random.default_rng([*seed, 1]).random(count, dtype=np.float32)) if layers else 0.5
 
 
-def on_grids(held: Any, grids: Sequence[TexelGrid], si: Any, way: Any) -> list[Any]:
+def on_grids(held: Any, grids: Grids, si: Any, way: Any) -> list[Any]:
     """Whether hits of rays in a direction lie on each grid."""
     front, shapes = dr.dot(si.n, way) < 0.0, {shape.id(): shape for shape in held.shapes()}
     sides = {0: True, 1: front, -1: ~front}

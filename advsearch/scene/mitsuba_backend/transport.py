@@ -148,8 +148,7 @@ class Bounce:
     bsdf_weight: Any  # the same for the path's direction over its density: the throughput of the vertex
 
     def slopes(self) -> tuple[Any, Any]:
-        """The derivatives of both values by the base colour, which is larger by `STEP` now; the second over the
-        density."""
+        """The derivatives of both values by the base colour, larger by `STEP` now; the second over the density."""
         bsdf_value = self.bsdf_weight * self.bsdf_sample.pdf
         slopes = []
         for wo, before, active in (

@@ -93,8 +93,7 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, left: Plugin) -> None:
 
 
 def _put(plugin: Plugin, key: list[str], value: Floats) -> bool:
-    """Set a number, colour, transform or picture by Mitsuba's name, where that is the way to it in a dictionary;
-    whether it is."""
+    """Set a number, colour, transform or picture by Mitsuba's name, where a dictionary has it; whether it does."""
     here, *rest = key
     if here.startswith("brdf_") and here not in plugin:  # the one surface of two sides
         here = next((name for name, inner in plugin.items() if isinstance(inner, Mapping)), here)
@@ -220,8 +219,7 @@ def plugin_numbers(description: SceneDescription, name: str, keys: tuple[str, ..
 
 @lru_cache(maxsize=1)
 def _all(description: SceneDescription) -> tuple[dict[str, PluginNumber], dict[str, str]]:
-    """Every number and colour of a scene by its key, without inputs but for those that it has; and the type of the
-    rest."""
+    """Every number and colour of a scene by its key, with an input if it has one; and the type of the rest."""
     scene = MitsubaScene(description, SMALL)
     inputs = {key: name for name, (key, takes) in scene.declared.items() if takes.write in (number, color)}
     numbers: dict[str, PluginNumber] = {}

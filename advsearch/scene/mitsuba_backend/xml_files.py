@@ -173,8 +173,7 @@ class _Text:
 
 
 def _plugin(path: Path, state: Any, number: int, referred: set[str]) -> Plugin:
-    """Return a parsed plugin with all that is in it, as `mitsuba.load_dict` takes it; ids that it names are put into
-    `referred`."""
+    """Return a parsed plugin with all in it, as `mitsuba.load_dict` takes it; ids that it names go into `referred`."""
     kinds, props = mi.Properties.Type, state.nodes[number].props
     entries: Plugin = {"type": props.plugin_name()}
     last: dict[str, int] = {}

@@ -139,8 +139,7 @@ WETNESS = 0.45
 
 
 def reflectance(x: Doubles, y: Doubles, grain: Doubles | None = None) -> Doubles:
-    """Return the linear reflectance (N, 3) of the ground at x along the road and y across it (N,); `grain` about 0 (N,)
-    is what makes asphalt uneven."""
+    """Return the linear reflectance (N, 3) of the ground at x along the road and y across; `grain` makes it uneven."""
     grain = np.zeros_like(x) if grain is None else grain
     wheels = np.exp(-(((np.abs(y) - 0.75) / 0.3) ** 2)) + np.exp(-(((np.abs(y - 3.5) - 0.75) / 0.3) ** 2))
     value = 0.085 * (1.0 - 0.12 * wheels) * (1.0 + grain)
@@ -159,8 +158,7 @@ def reflectance(x: Doubles, y: Doubles, grain: Doubles | None = None) -> Doubles
 
 @lru_cache(maxsize=4)
 def road(wet: bool, metres: float) -> MeshPart:
-    """Return the road, dark and reflecting where it is wet; `metres` are those of one object size, the scene's unit of
-    length."""
+    """Return the road, dark and reflecting where it is wet; `metres` are those of one object size."""
     corners = np.array([[-1.0, EDGES[0]], [1.0, EDGES[0]], [1.0, EDGES[1]], [-1.0, EDGES[1]]])
     places = corners * np.array([LENGTH / 2, 1.0])
     uvs = np.stack([places[:, 0] / PERIOD, (places[:, 1] - EDGES[0]) / (EDGES[1] - EDGES[0])], axis=1)
