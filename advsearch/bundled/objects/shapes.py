@@ -153,9 +153,6 @@ def stretched(patches: Iterable[Patch], factors: Sequence[float] | Array) -> lis
     return [replace(p, vertices=p.vertices * by, normals=unit(p.normals / by)) for p in patches]
 
 
-# ------------------------------------------------------------------------------------------------ grid patches
-
-
 def grid(tag: str, points: Array, normals: Array, size: tuple[float, float], down: Array, across: Array) -> Patch:
     """Return the patch over a grid of points (R, C, 3) with unit normals: u runs along columns, v along rows, du x dv
     points outwards; `down` (R,) and `across` (C,) are the rows' v and the columns' u, which increase from 0 to 1."""
@@ -185,9 +182,6 @@ def _fan(count: int) -> Indices:
     """The faces (count, 3) between a middle, which is vertex 0, and a ring of `count` vertices after it."""
     j = np.arange(count)
     return np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % count], axis=1).astype(np.int64)
-
-
-# ----------------------------------------------------------------------------------------- surfaces of revolution
 
 
 def _profile_normals(parts: Sequence[Array]) -> list[Array]:
@@ -319,9 +313,6 @@ def sphere(
     cut = rows // 4
     pieces = [(tag, curve[: cut + 1]), (tag, curve[cut : rows - cut + 1]), (tag, curve[rows - cut :])]
     return placed(lathe(pieces, columns), offset=centre)
-
-
-# --------------------------------------------------------------------------------------------- sweeps and boxes
 
 
 def frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:

@@ -16,9 +16,6 @@ from advsearch.scene.mitsuba_backend.variant import dr, mi
 _OUTLINES, _PATHS, _SHADOWS = 1, 2, 3  # streams of random numbers of one seed; the interior has number 0
 
 
-# ---- the scene as we see it -----------------------------------------------------------------------------------------
-
-
 class Camera:
     """A pinhole camera, from Mitsuba's sensor: its Dr.Jit transforms, and its size in pixels."""
 
@@ -217,9 +214,6 @@ GRAZING = 0.02  # smallest cosine at a lit point that is divided by
 NEAREST = 1e-3  # smallest depth of an edge that is used, in world units; there is no clipping of edges
 
 
-# ---- outlines -------------------------------------------------------------------------------------------------------
-
-
 def outline_terms(view: FilmView, mesh: TriMesh, seed: int, number: int, spp: int) -> Any:
     """A number whose gradient is the outline term's, for the edges of one mesh, which has a number."""
     stream = stream_of(seed, _OUTLINES, number)
@@ -303,9 +297,6 @@ def _edges(places: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     number = torch.arange(len(owner))
     first = torch.full((len(keys),), len(owner)).scatter_reduce(0, owner, number, "amin")  # repeatable, unlike indexing
     return sides[first], owner, across
-
-
-# ---- shadows --------------------------------------------------------------------------------------------------------
 
 
 def shadow_terms(view: FilmView, mesh: TriMesh, seed: int, number: int, spp: int) -> Any:

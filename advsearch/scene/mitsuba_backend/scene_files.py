@@ -294,12 +294,18 @@ class _ObjectFrame:
         move[:3, 3] = (-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2])
         self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ move @ turn
 
-    def moved(self, plugin: Mapping[str, object]) -> Plugin:
-        """Return a plugin at the top of a scene in its place."""
+    def moved(self, plugin: Mapping[str, object], *, top: bool = True) -> Plugin:
+        """Return a plugin at the top of a scene, or within another, in its place; media are scaled everywhere."""
         kind, entries = plugin["type"], dict(plugin)
-        if kind == "merge":
+        if kind in MEDIA:
+            entries["scale"] = float(np.asarray(entries.get("scale", 1.0))) * self.size
+        elif kind in ("gridvolume", "constvolume"):
+            entries["to_world"] = self.matrix @ shapes.pose_of(plugin)
+        elif not top:
+            pass
+        elif kind == "merge":
             return with_inner(entries, self.moved)
-        if kind in SHAPES - {"shapegroup", "merge"}:
+        elif kind in SHAPES - {"shapegroup"}:
             entries["to_world"] = self.matrix @ shapes.pose_of(plugin)
         elif kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
             turn = np.eye(4)
@@ -316,16 +322,7 @@ class _ObjectFrame:
                 entries["to_world"] = self.matrix @ shapes.pose_of(plugin)
             power = "irradiance" if kind == "projector" else "intensity"
             entries[power] = _times(entries.get(power, 1.0), self.size**-2, str(kind))
-        return with_inner(entries, self._inside)
-
-    def _inside(self, plugin: Mapping[str, object]) -> Plugin:
-        """Return a plugin within another: media and volumes are scaled."""
-        entries = dict(plugin)
-        if plugin["type"] in MEDIA:
-            entries["scale"] = float(np.asarray(entries.get("scale", 1.0))) * self.size
-        if plugin["type"] in ("gridvolume", "constvolume"):
-            entries["to_world"] = self.matrix @ shapes.pose_of(plugin)
-        return with_inner(entries, self._inside)
+        return with_inner(entries, lambda inner: self.moved(inner, top=False))
 
 
 def _times(value: object, factor: float, kind: str) -> object:
