@@ -274,8 +274,6 @@ _STROKES = {  # letters in a cell 1 high and 0.6 wide: runs of points (x, y)
            (0.02, 0.2)]],
     "P": [[(0.04, 0.0), (0.04, 0.97), (0.46, 0.97), (0.58, 0.85), (0.58, 0.58), (0.46, 0.46), (0.04, 0.46)]],
 }  # fmt: skip
-
-
 FINISHES = {
     "face": Material(roughness=0.35, clearcoat=0.4), "metal": Material(roughness=0.5, metallic=0.6),
     "post": Material(roughness=0.45, metallic=0.7), "rubber": Material(roughness=0.85),

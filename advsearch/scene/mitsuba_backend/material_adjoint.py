@@ -58,8 +58,6 @@ LIMITS: Mapping[str, str] = {
 }  # fmt: skip
 """What the estimator does not cover, and what that cost where it was measured. Errors are relative, of the mean of
 several seeds over six pose axes; noise is the standard deviation of one estimate."""
-
-
 ROUGH_COTANGENT = 0.5  # a cotangent whose neighbours are less correlated than this counts as rough
 ROUGH_TILE = 16  # pixels along a tile that shares its random numbers, for a rough cotangent
 

@@ -32,8 +32,6 @@ NOTHING = {"type": "null"}  # the surface of what only bounds a medium
 Y_TO_Z = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 MOST_PARTS = 2000  # plugins at the top of a scene
 DIAGONAL = math.hypot(36.0, 24.0)  # of the film of which Mitsuba's `focal_length` speaks, millimetres
-
-
 NUMBERS: Mapping[str, tuple[tuple[int, ...], str]] = {
     **dict.fromkeys(("radius", "fov", "width", "height"), ((), "a number")),
     **dict.fromkeys(("center", "p0", "p1", "position", "direction"), ((3,), "three numbers")),

@@ -35,8 +35,6 @@ WALL, PANE, LEAF, IRON = (
     Material(roughness=0.7, specular=0.25), Material(roughness=0.45, specular=0.5),
 )  # fmt: skip
 WET_WALL = Material(roughness=0.5, specular=0.4)
-
-
 LIT = {  # luminance by night, cd/m2: a lamp puts 15 lux on the road below it (7.5 m, 0.36 x 0.22 m)
     "street-lamps": np.array((10650.0 * 1.16, 10650.0 * 0.98, 10650.0 * 0.73), np.float32),
     "lit-windows": np.array((36.0, 23.5, 10.0), np.float32),
