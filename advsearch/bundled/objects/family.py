@@ -84,9 +84,9 @@ def painted(
     image = np.zeros((side, side, 3))
     used = np.zeros((side, side), dtype=bool)
     for patch, place in zip(patches, places, strict=True):
-        a, b = (  # of every texel, row by row from the bottom, clamped in the gutter
-            np.clip((np.arange(count) + 0.5 - GUTTER) / (count - 2 * GUTTER), 0.0, 1.0)
-            for count in (place.width, place.height)
+        # of every texel, row by row from the bottom, clamped in the gutter
+        a, b = (
+            np.clip((np.arange(n) + 0.5 - GUTTER) / (n - 2 * GUTTER), 0.0, 1.0) for n in (place.width, place.height)
         )
         a, b = np.tile(a, place.height), np.repeat(b, place.width)
         u, v = (b, 1.0 - a) if place.turned else (a, b)

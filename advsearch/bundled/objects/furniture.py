@@ -77,11 +77,9 @@ def chair(draw: Draw) -> Instance:
 
     fabric = draw.colour("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
     cover = draw.pick(
-        clouded(fabric, 0.8, 1.5, offset),
-        stripes(fabric, shade(fabric, 1.5), 6.0),
-        checks(fabric, hexed("efe6d4"), 4.0),
-        dots(solid(fabric), hexed("f4efe4"), 6.0),
-    )
+        clouded(fabric, 0.8, 1.5, offset), stripes(fabric, shade(fabric, 1.5), 6.0),
+        checks(fabric, hexed("efe6d4"), 4.0), dots(solid(fabric), hexed("f4efe4"), 6.0),
+    )  # fmt: skip
     seat_paint = cover if draw.chance(0.25) else grain(0)
     paints = {"up": grain(2), "along": grain(0), "cross": grain(1), "seat": seat_paint, "cushion": cover}
     return Instance(turned, paints, finish(draw, 0.45, 0.2))

@@ -134,10 +134,8 @@ def banana(draw: Draw) -> Instance:
     body = np.clip((at - stem) / (0.26 * length), 0.0, 1.0) ** 0.75
     taper = np.clip((length - at) / (0.24 * length), 0.0, 1.0) ** 0.62
     neck = draw(0.3, 0.24, 0.4)
-    radius = thick * np.maximum(
-        neck * (1.0 + 0.25 * np.exp(-at / 0.5)),
-        np.sin(0.5 * np.pi * body) * np.maximum(np.sin(0.5 * np.pi * taper), 0.26),
-    )
+    full = np.sin(0.5 * np.pi * body) * np.maximum(np.sin(0.5 * np.pi * taper), 0.26)
+    radius = thick * np.maximum(neck * (1.0 + 0.25 * np.exp(-at / 0.5)), full)
     radius = np.convolve(np.pad(radius, 2, mode="edge"), np.ones(5) / 5, mode="valid")
     ridge = draw(0.06, 0.02, 0.1)
     phi = 2 * np.pi * np.arange(30) / 30
@@ -159,10 +157,8 @@ def banana(draw: Draw) -> Instance:
         base = mix(skin, shade(skin, 0.86), noise(xyz / 2.2 + offset))
         base = mix(base, green, np.clip(1.0 - (start - 0.9 * stem) / 2.6, 0.0, 1.0) * 0.75)
         base = mix(base, green, np.clip(1.0 - end / 2.2, 0.0, 1.0) * 0.5)
-        fleck = np.maximum(
-            step(noise(xyz * np.array([1.9, 1.9, 3.1]) + offset), 1.0 - amount, 0.08),
-            step(noise(xyz * 3.7 + offset), 1.02 - amount, 0.08),
-        )
+        fleck = step(noise(xyz * np.array([1.9, 1.9, 3.1]) + offset), 1.0 - amount, 0.08)
+        fleck = np.maximum(fleck, step(noise(xyz * 3.7 + offset), 1.02 - amount, 0.08))
         base = mix(base, brown, fleck * 0.85)
         base = mix(base, brown, step(-start, -0.5 * stem, 1.3) * 0.5)
         base = mix(base, tip, step(-start, -0.45, 0.5))
@@ -309,10 +305,8 @@ def stop_sign(draw: Draw) -> Instance:
     plate = shapes.placed(plate, offset=(0.036, 0.0, height))
     tube = shapes.rounded([(0.03, 0.0), (0.03, height + 0.7 * radius), (0.0, height + 0.7 * radius + 0.004)], 0.004, 2)
     post = shapes.lathe([("post", [(0.0, 0.0), (0.03, 0.0)]), ("post", tube[:-1]), ("post", tube[-2:])], 20)
-    foot = [
-        *shapes.box("rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), 0.02, 2),
-        *shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), 0.01, 1),
-    ]
+    foot = shapes.box("rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), 0.02, 2)
+    foot += shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), 0.01, 1)
     heights = (height - 0.5 * radius, height + 0.5 * radius)
     clamps = [patch for z in heights for patch in shapes.box("post", (0.008, 0.0, z), (0.05, 0.09, 0.03), 0.006, 1)]
     grey = draw.colour("9a9da0", "7d8083", wild=0.0)

@@ -91,9 +91,8 @@ class Fronts:
             ]
         )  # fmt: skip
         around = around[around[:, 3] - around[:, 2] > 1e-6]
-        self.walls.wall(
-            frame, around, 0.0, np.column_stack([around[:, :2] / paint.PERIOD, paint.wall_row(kind, around[:, 2:])])
-        )
+        uvs = np.column_stack([around[:, :2] / paint.PERIOD, paint.wall_row(kind, around[:, 2:])])
+        self.walls.wall(frame, around, 0.0, uvs)
         zero, u = 0.0 * in_left, np.stack([in_left, in_left, in_left + deep, in_left + deep], 1) / paint.PERIOD
         out, up = np.stack([zero, zero, -deep, -deep], 1), np.stack([in_low, in_high, in_high, in_low], 1)
         for at, turn in ((in_left, -1), (in_right, 1)):  # the reveals
