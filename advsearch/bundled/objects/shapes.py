@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicHermiteSpline, RegularGridInterpolator
 
-from advsearch.scene.assets import face_vectors
+from advsearch.scene.assets import Bools, Ints, face_vectors
 
 # ---- Plane and space curves from which the bundled objects are made. Float64; lengths in the object's units ---------
 
@@ -121,7 +121,6 @@ def ellipse(width: float, height: float, count: int = 20) -> Array:
     return np.stack([width * np.cos(t), height * np.sin(t)], axis=1)
 
 
-Indices = npt.NDArray[np.int64]
 Rest = Callable[[Array, Array], Array]
 HARD_ANGLE = 40.0  # degrees; where two parts of a profile meet at more than this, the edge stays hard
 
@@ -134,7 +133,7 @@ class Patch:
     vertices: Array  # (V, 3) positions
     normals: Array  # (V, 3) unit normals, outwards
     uvs: Array  # (V, 2) chart coordinates in [0, 1]
-    faces: Indices  # (F, 3) vertex indices
+    faces: Ints  # (F, 3) vertex indices
     size: tuple[float, float]  # width and height of the chart, in object units; its share of the atlas follows from it
     rest: Rest  # maps (N,) u and (N,) v to the (N, 3) surface points as they were before `placed`
 
@@ -178,7 +177,7 @@ def _along(curve: Array) -> tuple[Array, float]:
     return at / at[-1], float(at[-1])
 
 
-def _fan(count: int) -> Indices:
+def _fan(count: int) -> Ints:
     """The faces (count, 3) between a middle, which is vertex 0, and a ring of `count` vertices after it."""
     j = np.arange(count)
     return np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % count], axis=1).astype(np.int64)
@@ -431,7 +430,7 @@ def box(
 # A curve is where a function of the surface's points is zero. Triangles that it crosses are split there, so that the
 # edge is as smooth as the function and not as coarse as the grid.
 
-Bools = npt.NDArray[np.bool_]
+
 Field = Callable[[Array], Array]  # (N, 3) points to (N,) values, positive inside; about the distance to the edge
 SNAP = 0.1  # share of an edge within which a cut goes through the edge's end: thinner slivers are not worth a triangle
 
@@ -464,7 +463,7 @@ def cropped(patch: Patch) -> Patch:
     return replace(patch, uvs=uvs, size=size, rest=lambda u, v: patch.rest(low[0] + u * span[0], low[1] + v * span[1]))
 
 
-def _edges(patch: Patch) -> Indices:
+def _edges(patch: Patch) -> Ints:
     pairs = np.concatenate([patch.faces[:, [0, 1]], patch.faces[:, [1, 2]], patch.faces[:, [2, 0]]])
     return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64))
 

@@ -25,16 +25,7 @@ from advsearch.scene.grounds import enclosed
 from advsearch.scene.mitsuba_backend import parts
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, repeating, sampling_weights, textured_emission
 from advsearch.scene.mitsuba_backend.transport import Paths, collect, first_hits
-from advsearch.scene.mitsuba_backend.variant import (
-    Plugin,
-    Recordings,
-    dr,
-    fewer_warnings,
-    media_in,
-    mi,
-    one_at_a_time,
-    population,
-)
+from advsearch.scene.mitsuba_backend.variant import Plugin, Recordings, dr, mi, one_at_a_time, population
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
 from advsearch.scene.parts import PATTERN, Lamp, LampGlass, plugins_in
 from advsearch.scene.surfaces import Surfaces
@@ -43,8 +34,7 @@ MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
 NO_ROULETTE, ROULETTE = 1000, 2
 """Segments after which Russian roulette starts: never where paths soon leave the scene by themselves. Among houses it
 saves a third of the time without more noise; from 1 on, single gradients were a fifth off."""
-SHADOW_SPP = 4
-"""Samples a pixel of the material form's shadow term; without it a resting object's gradient has a cosine of 0.66."""
+SHADOW_SPP = 4  # samples a pixel of the shadow term; without it a resting object's gradient has a cosine of 0.66
 BASE_COLOR = "object.base_color"  # input: (h, w, 3) linear reflectance of the object, row 0 at v = 1 (top of the image)
 
 
@@ -135,8 +125,10 @@ class MitsubaScene:
             self._base: dict[str, Any] = {}
             self._applied: dict[str, Tensor] = {}
             self._recorded = Recordings()
-            media = media_in(self._scene) if self.volumetric else ()
-            population.add(self, self._scene, self._integrators, self.parameters, media=media)
+            bounds = self._scene.shapes() if self.volumetric else []
+            media = [side for shape in bounds for side in (shape.interior_medium(), shape.exterior_medium())]
+            held = self._scene, self._integrators, self.parameters
+            population.add(self, *held, media=tuple(medium for medium in media if medium is not None))
             self._every: dict[str, Tensor] = {}
             if "uploads" not in leave_out:
                 self._every = {name: self.base(name) for name in sorted(self.names)}
@@ -276,6 +268,7 @@ class MitsubaScene:
                 shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
             self._set(inputs)
             held, tracked, gradients = dict[str, Any](), dict[str, Any](), dict[str, Tensor]()
+            level = mi.log_level()
             try:
                 for name in (*sorted(beside - set(wanted)), *wanted):
                     key, takes = self.declared[name]
@@ -286,14 +279,15 @@ class MitsubaScene:
                     self.parameters[key] = takes.write(tracked[name]) if takes.write else tracked[name]
                 self.parameters.update()
                 spp, arriving = next_count(self.sampler, spp), mi.TensorXf(shown)
-                with fewer_warnings():  # it warns at every call of a film that samples beyond its border
-                    self._integrator(method).render_backward(
-                        self._scene, self.parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
-                    )
+                mi.set_log_level(mi.LogLevel.Error)  # it warns at every call of a film that samples beyond its border
+                self._integrator(method).render_backward(
+                    self._scene, self.parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
+                )
                 for name in wanted:
                     gradients[name] = dr.grad(tracked[name]).torch().clone().reshape(inputs[name].shape)
                 return gradients
             finally:
+                mi.set_log_level(level)
                 while held:  # what is put back must have no second owner, see `_set`
                     self.parameters.__setitem__(*held.popitem())
                 self.parameters.update()

@@ -142,10 +142,8 @@ def pose_of(plugin: Mapping[str, object]) -> Doubles:
 
 
 Plugins = Mapping[str, Mapping[str, object]]
-MOST, DARKEST = 2.0, 1e-3
-"""Of a haze: the largest extinction per object size, and the least share of the light that is scattered."""
-OFF = 0.05
-"""By what share of its radius the ball's middle may lie beside the object's; its edge is in the far background."""
+MOST, DARKEST = 2.0, 1e-3  # of a haze: largest extinction per object size, and least share of light scattered
+OFF = 0.05  # share of its radius by which the ball's middle may lie beside the object's; its edge is far off
 _OF_BALL = {"type", "id", "radius", "center", "to_world", "bsdf", "interior"}
 _OF_MEDIUM = {"type", "id", "sigma_t", "albedo", "scale", "phase"}
 
@@ -208,12 +206,10 @@ COLORS = {  # surfaces with a base colour, and its name there
 GREY = 0.5  # reflectance where a surface says none: Mitsuba's default
 PLAIN_SIZE = 8  # texels of each side of a base colour that is the same everywhere
 SHARP_SIZE = 256  # smallest side of a base colour whose texels are not interpolated: smaller ones are repeated
-PLACED = frozenset(("bitmap", "checkerboard"))
-"""Textures that are looked up by texture coordinates, after a transform of their own."""
+PLACED = frozenset(("bitmap", "checkerboard"))  # looked up by texture coordinates, after a transform of their own
 BOUND = PLACED | {"mesh_attribute", "normalmap", "bumpmap", "hair"}
 """What shows something else on a mesh with other texture coordinates, or without its attributes."""
-ANISOTROPIC = frozenset(("alpha_u", "alpha_v", "anisotropic"))
-"""Numbers of surfaces that look different along u and along v."""
+ANISOTROPIC = frozenset(("alpha_u", "alpha_v", "anisotropic"))  # numbers of what looks different along u and v
 OF_THE_PICTURE = frozenset(("type", "id", "bitmap", "filename", "raw", "format", "to_uv"))
 """Entries of a bitmap that the picture itself has, once it is read."""
 

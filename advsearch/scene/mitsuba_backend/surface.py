@@ -22,8 +22,7 @@ from advsearch.scene.mitsuba_backend import texel_rays
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import Recordings, dr, mi, one_at_a_time
 
-SHARP, WIDE = 0.15, 0.4
-"""Spreads of gloss between which what one ray meets on the ground gives way to what surrounds the object."""
+SHARP, WIDE = 0.15, 0.4  # spreads of gloss between which one ray to the ground gives way to what surrounds the object
 CAMERA = 16  # numbers of a camera
 PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
 """Where the rays of a pixel go through it: a turned grid, which sees upright and level edges at four places."""

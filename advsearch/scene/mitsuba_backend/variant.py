@@ -145,10 +145,4 @@ class Population:
         return [medium for _, media in self._held.values() for medium in media]
 
 
-def media_in(scene: Any) -> tuple[Any, ...]:
-    """Return the media in the shapes of Mitsuba's scene."""
-    sides = [side for shape in scene.shapes() for side in (shape.interior_medium(), shape.exterior_medium())]
-    return tuple(medium for medium in sides if medium is not None)
-
-
 population = Population()  # of this process

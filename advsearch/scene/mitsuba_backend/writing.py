@@ -35,8 +35,7 @@ NAME = "scene.xml"
 MATERIAL = ("roughness", "metallic", "specular", "clearcoat")
 SCATTERINGS = 3  # segments that paths in haze have beyond those between surfaces: stock Mitsuba counts both alike
 ABSENT = ("to_world", *CAMERA_NUMBERS.values())  # entries that a dictionary need not have for them to be set
-BAKED = ("filename", "to_world", "flip_tex_coords")
-"""Entries of a mesh from a file that are in the mesh that is written."""
+BAKED = ("filename", "to_world", "flip_tex_coords")  # entries of a mesh from a file that are in what is written
 
 
 def write_scene(

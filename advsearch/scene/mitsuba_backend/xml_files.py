@@ -37,8 +37,7 @@ MOST_ELEMENTS = 50_000
 DEEPEST = 40
 MOST_INCLUDED = 50
 LONGEST = 10_000  # letters of a text with the values of its `$names`
-TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}
-"""Elements that are not called as Mitsuba calls the type, in small letters."""
+TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}  # elements that are not called as the type is
 _PLACE = re.compile(r"^\[.*?\] Error while loading string \(line (\d+), col \d+\): ", re.DOTALL)
 
 

@@ -21,8 +21,7 @@ from advsearch.scene.places import paint
 from advsearch.scene.places.houses import Fronts
 from advsearch.scene.places.quads import DRY, FRONT, KERBS, ROAD, SHOWN, WET, Quads, Wall, shown
 
-END, CROSSING, FAR = 150.0, 12.0, 4000.0
-"""Where the street ends, how wide the one is that it meets, and how far the plain goes."""
+END, CROSSING, FAR = 150.0, 12.0, 4000.0  # where the street ends, how wide what it meets is, how far the plain goes
 KERB = 0.12
 TREES = (-118.0, -97.0, -76.0, -55.0, -34.0, -15.0, 22.0, 43.0, 64.0, 85.0, 106.0, 127.0)
 """x of the trees on the right; those on the left stand 9 m on."""

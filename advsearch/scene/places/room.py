@@ -22,8 +22,7 @@ CASE, BOARDS = ((-1.75, -1.46), (-1.5, 1.1)), (-0.69, -0.33, 0.03, 0.39, 0.75, 1
 """From and to in x and y of the shelves at the wall, and the heights of their boards."""
 WINDOW = ((-0.9, 1.5), (0.12, 1.5))  # from and to in x and z, in the wall at the largest y
 REVEAL, LAMP = 0.16, 0.24  # how far the pane stands back, and half a side of the lamp
-DAY, NIGHT, SHADE = 2600.0, 0.6, 4200.0
-"""Luminance of the sky in the window by day and by night, and of the lamp, cd/m2."""
+DAY, NIGHT, SHADE = 2600.0, 0.6, 4200.0  # luminance of the window's sky by day and by night, and of the lamp, cd/m2
 USUAL = 1000.0  # luminance of a radiance of 1, cd/m2, where the light has no unit
 STRIP, TEXEL, COLUMNS = 0.5, 0.0125, 96
 """How high each strip of the texture is, how large a texel, and how many there are along a strip of 1.2 m."""
