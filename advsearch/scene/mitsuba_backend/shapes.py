@@ -100,7 +100,7 @@ def _solid(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
         down = np.pi * uvs[:, 1]
         vertices = normals = np.stack([*(np.sin(down) * _circle(uvs[:, 0])), np.cos(down)], axis=1)
         local[:3, :3] *= radius
-        local[:3, 3] = shape.get("center", (0.0, 0.0, 0.0))
+        local[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
     elif kind == "cylinder":  # open at both ends, as Mitsuba's
         uvs, faces = _grid(turn, np.array([0.0, 1.0]))
         vertices = np.stack([*_circle(uvs[:, 0]), uvs[:, 1]], axis=1)

@@ -61,8 +61,8 @@ class Paths:
 def mean_of(passes: Sequence[Paths]) -> Paths:
     """Return the mean pictures of passes with as many samples each; it has no vertices."""
     names = ("radiance", "coverage", "background", "albedo", "normal")
-    means = (torch.stack([getattr(paths, name) for paths in passes]).mean(dim=0) for name in names)
-    return Paths(*means, vertices=[])
+    means = {name: torch.stack([getattr(paths, name) for paths in passes]).mean(dim=0) for name in names}
+    return Paths(**means, vertices=[])
 
 
 def collect(
@@ -128,7 +128,7 @@ def collect(
         dr.eval(uv, weight, pixel, sharp)
         places, weights = (torch.stack([axis.torch() for axis in axes], dim=1) for axes in (uv, weight))
         kept.append(Vertices(pixel.torch().long(), places, weights, sharp.torch().bool()))
-    return Paths(*parts, kept)
+    return Paths(parts[0], parts[1], parts[2], parts[3], parts[4], kept)
 
 
 @dataclass(frozen=True)
