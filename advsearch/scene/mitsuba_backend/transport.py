@@ -61,8 +61,8 @@ class Paths:
 def mean_of(passes: Sequence[Paths]) -> Paths:
     """Return the mean pictures of passes with as many samples each; it has no vertices."""
     names = ("radiance", "coverage", "background", "albedo", "normal")
-    means = {name: torch.stack([getattr(paths, name) for paths in passes]).mean(dim=0) for name in names}
-    return Paths(**means, vertices=[])
+    means = [torch.stack([getattr(paths, name) for paths in passes]).mean(dim=0) for name in names]
+    return Paths(means[0], means[1], means[2], means[3], means[4], [])
 
 
 def collect(

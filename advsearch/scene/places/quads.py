@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from advsearch.scene.assets import Bools, Doubles, Floats, Material, Mesh
 from advsearch.scene.color import linear_to_srgb
@@ -174,6 +173,8 @@ def road(wet: bool, metres: float) -> MeshPart:
 @lru_cache(maxsize=2)
 def _texture(wet: bool) -> Floats:
     """One period of the road, (h, w, 3) display-referred, multiples of 1/255, row 0 on the left."""
+    from scipy.ndimage import uniform_filter  # few scenes have this road
+
     width, height = round(PERIOD / TEXEL), round((EDGES[1] - EDGES[0]) / TEXEL)
     fine = np.random.Generator(np.random.PCG64(7)).random((height, width))
     grain = np.zeros_like(fine)
