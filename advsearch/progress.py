@@ -51,11 +51,9 @@ def watcher(watched: Watched) -> Progress:
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-
 PATIENCE = 2.0  # seconds after which a stage is announced where there is no terminal; a shorter one is not worth a line
 MOST_BARS = 5  # stages that a terminal shows at once
 UPDATE = 0.2  # least seconds between two changes of a notebook's line
-
 LINE_INTERVAL, LINE_SHARE = 5.0, 0.1
 """Seconds between two lines where there is no terminal, and the share of a stage's time so far that they are at least.
 """
@@ -239,9 +237,8 @@ def _seconds(seconds: float) -> str:
 
 def info_text(info: dict[str, float | str]) -> str:
     """Return ``best 0.31, epsilon 0.1``."""
-    return ", ".join(
-        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}" for name, value in info.items()
-    )
+    values = {name: f"{value:.3g}" if isinstance(value, float) else value for name, value in info.items()}
+    return ", ".join(f"{name} {value}" for name, value in values.items())
 
 
 def escaped(text: str, encoding: str = "utf-8") -> str:

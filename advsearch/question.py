@@ -14,8 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cached_property
-from importlib import import_module
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_args, get_type_hints
 
@@ -84,6 +83,17 @@ class Asked(Generic[Settings]):
         return kind(**{**common, "command_line": self.config.command_line(), **fields})
 
 
+def carried_out(function: Callable[[Asked[Settings]], AnyResult], asked: Asked[Settings]) -> AnyResult:
+    """Return the result of a function, kept in its run with page and figure, unless the function has kept it."""
+    with asked:
+        result = function(asked)
+        if "run" not in vars(asked):
+            return result
+        for suffix, data in result_figure(shown(result)).items():
+            write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
+        return keep_result(asked.run, result)
+
+
 def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path | None = None) -> Result:
     """Ask the question that a configuration asks, and keep the run in a directory.
 
@@ -100,10 +110,8 @@ def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path
     check_names(config)
     keeps_run = resumed is None and getattr(config, "out", None) is None
     with begun(config) if keeps_run else nullcontext(resumed) as folder:  # before what is heavy is imported
-        room = registry.room(config.command)
-        ask = room.from_config if room else None
-        if ask is None:
-            ask = getattr(import_module(f"advsearch.api.{config.command}"), f"{config.command}_from_config")
+        ask = registry.part_of(config.command, "from_config")
+        ask = ask or registry.imported(f"advsearch.api.{config.command}:{config.command}_from_config")
         made = ask(config, progress=progress, **({} if folder is None else {"resumed": folder}))
     result: Result = made if isinstance(made, Result) else made.summary
     return result
@@ -134,16 +142,9 @@ class Question(Generic[AnyResult]):
         self, config: Any, *, progress: Progress | None = None, resumed: Path | None = None, **more: Any
     ) -> AnyResult:
         """Do what a configuration describes, and keep it in its run; `more` is for the function alone."""
-        with Asked(config, progress, resumed) as asked:
-            result = self.function(asked, **more)
-            if "run" not in vars(asked):  # else the function has kept it itself
-                return result
-            for suffix, data in result_figure(shown(result)).items():
-                write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
-            return keep_result(asked.run, result)
+        return carried_out(partial(self.function, **more), Asked(config, progress, resumed))
 
     def __call__(self, *args: Any, **settings: Any) -> AnyResult:
-        """Ask it from Python."""
         made: AnyResult = self.python(*args, **settings)
         return made
 
@@ -181,8 +182,7 @@ def question(*examples: str, **said: Any) -> Callable[[Callable[..., AnyResult]]
         hints = get_type_hints(function)
         first, result = next(iter(inspect.signature(function).parameters)), hints["return"]
         (config,) = get_args(hints[first])
-        return Question(
-            function, config, (*get_args(result), result)[0], examples, **said
-        )  # the first of several kinds
+        result = (*get_args(result), result)[0]  # the first of several kinds
+        return Question(function, config, result, examples, **said)
 
     return decorate

@@ -125,8 +125,7 @@ class ShownResult:
 
 def shown(result: Result) -> ShownResult:
     """Return what a person is shown of the result of any question."""
-    room = registry.room(result.command)
-    made: ShownResult = room.shown(result) if room and room.shown else fields_shown(result)
+    made: ShownResult = (registry.part_of(result.command, "shown") or fields_shown)(result)
     return made
 
 

@@ -32,19 +32,16 @@ from advsearch.scene.settings import ORBIT_CAMERA, POSE, SETTINGS
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
-FRAME_FILL = 0.86
-"""Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
+FRAME_FILL = 0.86  # share of the picture's half-width that the object may reach when the distance is worked out
 CLEARANCE = 0.02  # smallest distance, in object sizes, to the sphere around the object
-STEEPEST = math.sin(math.radians(89.0))
-"""Sine of the elevation at which a camera stays that is to be higher above the object than it is away."""
+STEEPEST = math.sin(math.radians(89.0))  # sine of the largest elevation, for a height that would need a steeper one
 NEAREST = 1e-3  # depth up to which points have no place in the picture
 DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
 
 
 def framing_distance(description: SceneDescription, fov: Tensor, aspect: float) -> Tensor:
     """Return the distance of the camera to the middle of a scene's object, () float64 in object sizes, for a field of
-    view () along the larger side of the picture, degrees, and an aspect of width over height; differentiable in the
-    first."""
+    view () along the larger side of the picture, degrees, and its width over height; differentiable in the first."""
     offsets, edge = _offsets(description).to(fov.device), _edge(description, fov, aspect)
     azimuth, elevation, roll = (float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW)
     fits = _from_one_side(offsets, camera_axes(azimuth, elevation, roll), edge * FRAME_FILL)
@@ -64,13 +61,12 @@ def camera_axes(azimuth: float, elevation: float, roll: float) -> Doubles:
     for the camera's direction around the object, its height above the ground plane, and the picture's rotation,
     counter-clockwise, all in degrees."""
     azimuth, elevation, roll = math.radians(azimuth), math.radians(elevation), math.radians(roll)
-    outwards = np.array(
-        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
-    )
+    level, up = math.cos(elevation), math.sin(elevation)
+    outwards = np.array([level * math.cos(azimuth), level * math.sin(azimuth), up])
     left = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
-    up = np.cross(-outwards, left)
-    left, up = math.cos(roll) * left + math.sin(roll) * up, math.cos(roll) * up - math.sin(roll) * left
-    return np.stack([left, up, outwards])
+    upright = np.cross(-outwards, left)
+    turned = math.cos(roll) * left + math.sin(roll) * upright, math.cos(roll) * upright - math.sin(roll) * left
+    return np.stack([*turned, outwards])
 
 
 def middle(description: SceneDescription) -> Doubles:
@@ -138,8 +134,7 @@ def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
     stands, by those that are called `pose:NAME.yaw` and so on."""
     pose = {own.name: value for own in POSE if (value := values.get(f"pose:{part.name}.{own.name}")) is not None}
     if pose:
-        places = standing(part)
-        pose = {**{own.name: float(own.default) for own in POSE}, **pose}
+        places, pose = standing(part), {**{own.name: float(own.default) for own in POSE}, **pose}
         part = replace(part, to_world=_posed(places, float(places[:, 2].min()), pose) @ part.to_world)
     return replace(part, material=part.material.with_values(values, f"material:{part.name}."))
 
@@ -171,9 +166,9 @@ def camera_to_world(description: SceneDescription, aspect: float | None = None) 
         return description.cameras[description.camera].to_world
     aspect = description.aspect if aspect is None else aspect
     number = description.number
-    asked = description.values["camera.distance"]
-    distance = 0.0 if asked is None else asked / description.metres
-    if asked is None:
+    if (asked := description.values["camera.distance"]) is not None:
+        distance = asked / description.metres
+    else:
         distance = float(framing_distance(description, torch.tensor(number("camera.fov"), dtype=torch.float64), aspect))
     elevation, height = number("camera.elevation"), description.values.get("camera.height")
     if height is not None:
@@ -208,8 +203,7 @@ def projected(
 
 
 def seated(carrier: Tensor, seat: Tensor) -> Tensor:
-    """Return the rigid pose (4, 4) of what sits at `seat` (4, 4) on what has the pose `carrier` (4, 4), which may be
-    scaled; differentiable."""
+    """Return the rigid pose (4, 4) of what sits at a seat (4, 4) on a carrier (4, 4), which may be scaled."""
     scale = torch.linalg.det(carrier[:3, :3]).abs() ** (1.0 / 3.0)
     return affine(carrier[:3, :3] / scale @ seat[:3, :3], carrier[:3, :3] @ seat[:3, 3] + carrier[:3, 3])
 

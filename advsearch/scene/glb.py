@@ -78,15 +78,12 @@ class GlbBuffer:
 Levels = npt.NDArray[np.uint8]
 COAT_ROUGHNESS = 0.316  # of Mitsuba's clearcoat, whose alpha is 0.1: the square root of it
 PLAIN = 0.5  # specular of a surface whose index of refraction is 1.5
-WEB_SIDE, WEB_QUALITY = 1024, 90
-"""Longest side in pixels of a texture in a file for the web, and the quality of its JPEG, from 1 to 95."""
-CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
-"""The camera of such a file: its place counts."""
+WEB_SIDE, WEB_QUALITY = 1024, 90  # longest side of a texture in a file for the web, and the quality of its JPEG
+CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}  # its place counts
 
 
 def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
-    """Return a mesh of a scene as its inputs, those of `MitsubaScene` that differ from the base values, have it: in
-    world space, z up."""
+    """Return a mesh of a scene, in world space and z up, by those inputs of `MitsubaScene` that are given."""
     begin = f"{part.name}."
     own = {key.removeprefix(begin): value.detach().cpu() for key, value in inputs.items() if key.startswith(begin)}
     places = dict(zip(("vertices", "normals"), MovingMesh(part.mesh, part.to_world).place(None, None), strict=True))
@@ -99,7 +96,6 @@ def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
 
 
 def glb(meshes: Sequence[Shape]) -> bytes:
-    """Return a binary glTF file of some meshes."""
     made = GlbBuffer()
     return made.file(_described(made, meshes, png_of))
 
@@ -146,9 +142,8 @@ def _described(made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Leve
         }
         whole = np.uint32 if len(mesh.vertices) > np.iinfo(np.uint16).max else np.uint16
         indices = made.accessor(mesh.faces.reshape(-1).astype(whole), "SCALAR")
-        header["meshes"].append(
-            {"name": shape.name, "primitives": [{"attributes": corners, "indices": indices, "material": number}]}
-        )
+        primitive = {"attributes": corners, "indices": indices, "material": number}
+        header["meshes"].append({"name": shape.name, "primitives": [primitive]})
         levels = _levels(shape.base_color)
         encoded = picture(levels) if shape.opacity is None else _cut_out_png(levels, _levels(shape.opacity))
         material = _material(shape, _texture(header, made, encoded))

@@ -116,7 +116,6 @@ class SpotLamp(_Point):
         return matrix
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
-        """As of a point, within its cone."""
         way, faced = super().lighting(place)
         cutoff, beam = self.cone
         along = -way @ self.to_world[:3, 2] / max(float(np.linalg.norm(way)), 1e-12)
@@ -163,7 +162,6 @@ class BeamLamp(ScenePart):
     dark: ClassVar[bool] = False
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
-        """As of a point, by the table."""
         way = self.to_world[:3, 3] - place
         aside, up, ahead = -way @ self.to_world[:3, :3]
         height, width = self.table.shape
@@ -189,7 +187,6 @@ class ProjectorPart(ScenePart):
 
     @property
     def aspect(self) -> float:
-        """Width over height."""
         return self.sides[1] / self.sides[0]
 
     @property
@@ -238,8 +235,7 @@ class PluginNumber:
 
 @dataclass(frozen=True, eq=False)
 class PluginNumbers(ScenePart):
-    """Numbers and colours of what is in the scene already. Takes the inputs of its numbers that begin with `NAME.`,
-    (1,) or (3,) each."""
+    """Numbers and colours of what is in the scene already. Takes their inputs, which begin with `NAME.`."""
 
     numbers: tuple[PluginNumber, ...] = ()  # some of the scene
 

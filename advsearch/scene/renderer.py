@@ -31,29 +31,15 @@ from advsearch.scene.assembly import ON_PICTURE, Motion, central
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import ImageFormation, Later, Moment, levels_of
 from advsearch.scene.geometry import camera_to_world, middle
-from advsearch.scene.gradients import (
-    BY_ADJOINT,
-    BY_DIFFERENCES,
-    DEFAULT_PIXELS,
-    DEFAULT_STEP,
-    STEP_RANGE,
-    TURN_STEP,
-    Group,
-    first_order,
-    first_plan,
-)
+from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_order, first_plan, steps_for
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.rig import Mount
 from advsearch.scene.surfaces import Surfaces
 
 MAX_SPP = 65536
-
 Configuration = Tensor | npt.NDArray[np.floating[Any]] | Sequence[float]  # a point of the unit box
-
-Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
-"""From scene inputs, seed and samples a pixel to linear radiance (H, W, 3)."""
-
+Source = Callable[[Mapping[str, Tensor], int, int], Tensor]  # from inputs, seed and spp to radiance (H, W, 3)
 Predict = Callable[[Mapping[str, Tensor]], Tensor]
 """From scene inputs to linear radiance (H, W, 3), or (H, W, 4) with coverage where there is a backdrop; differentiable.
 """
@@ -84,8 +70,7 @@ class InputSpace(Later, Protocol):
 
 
 MOST_MEASURED = 64  # coordinates of a group up to which it is measured how far they move outlines
-SMALL_PART = 0.0625
-"""Part of noise that is taken through the tone curve, which is straight over so little; see `Renderer.halves`."""
+SMALL_PART = 0.0625  # of noise, over which the tone curve is straight; see `Renderer.halves`
 
 
 class Renderer:
@@ -241,8 +226,7 @@ class Renderer:
 
     def surfaces(self, u: Configuration, fineness: int = 1, camera: int = 0) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel of u (d,), or of each of `fineness` by
-        `fineness` parts of it; as of `mask`. The cameras of a rig have numbers, of which 0 is the first, or the only
-        one."""
+        `fineness` parts of it; as of `mask`. The cameras of a rig have numbers from 0."""
         u, _ = self._given(u, 1)
         with torch.no_grad():
             rig = self.scene.made[0].rig
@@ -306,24 +290,21 @@ class Renderer:
             return u, u.detach() + mask * (u - u.detach())
 
     def _picture(self, u: Tensor, seed: int, spp: int, *, display: bool = True) -> Tensor:
-        """The picture of u, or else the radiance that is to be displayed; of a rig those of its cameras side by side,
-        (H, K W, 3)."""
-        rig = self.scene.made[0].rig
-        if not rig:
-            return self._view(None, u, seed, spp, display=display)
-        renders, seeds_of = self.renders, [seed, *(seeds.stream(seed, "camera", k) for k in range(1, len(rig)))]
-        views = [self._view(mount, u, noise, spp, display=display) for mount, noise in zip(rig, seeds_of, strict=True)]
+        """The picture of u, or its radiance before display; of a rig its cameras' side by side, (H, K W, 3)."""
+        renders, views = self.renders, list[Tensor]()
+        for number, mount in enumerate(self.scene.made[0].rig or (None,)):
+            noise = seeds.stream(seed, "camera", number) if number else seed
+            inputs = self._seen(mount, u)
+            hide = "backdrop.color" in inputs
+            if self.moments:
+                rendered = self._exposed(mount, u, noise, spp, hide)
+            else:
+                rendered = self.rendered(_traced(inputs), noise, spp, hide)
+            views.append(self.finished(rendered, inputs, u, display=display))
+        if len(views) == 1:
+            return views[0]
         self.renders = renders + 1  # one configuration, as budgets count it
         return torch.cat(views, dim=1)
-
-    def _view(self, mount: Mount | None, u: Tensor, seed: int, spp: int, *, display: bool) -> Tensor:
-        inputs = self._seen(mount, u)
-        hide = "backdrop.color" in inputs
-        if self.moments:
-            rendered = self._exposed(mount, u, seed, spp, hide)
-        else:
-            rendered = self.rendered(_traced(inputs), seed, spp, hide)
-        return self.finished(rendered, inputs, u, display=display)
 
     def _seen(self, mount: Mount | None, u: Tensor, then: Later | None = None) -> dict[str, Tensor]:
         """Scene inputs of u as a camera of a rig, or the only one, sees them: when it takes its picture, or `then`."""
@@ -407,8 +388,7 @@ class Renderer:
         moving = [number for group in few for number in range(group.begin, group.begin + group.size)]
         if motion is not None and moving:
             speeds = motion.speeds(lambda u: self.scene.assembly(self.space.inputs(u)), self.start, moving)
-        moving_a_pixel = DEFAULT_PIXELS / speeds.clamp_min(1e-3)
-        steps = torch.where(speeds > 1e-3, moving_a_pixel, torch.full_like(speeds, DEFAULT_STEP)).clamp(*STEP_RANGE)
+        steps = steps_for(speeds)
         for group in groups:
             if group.periodic and not bool(speeds[group.coordinates].any()):
                 steps[group.coordinates] = TURN_STEP

@@ -153,8 +153,7 @@ def _pose(scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres
 
 
 def ground_height(scene: SceneDescription, place: Doubles) -> float:
-    """Return how high the ground lies at a place (2,), object sizes: that of the road, with its pavements, of a room's
-    table or floor, or 0."""
+    """Return how high the ground lies at a place (2,), object sizes: road, pavement, table or floor; or 0."""
     laid = (part for name, part in scene.around.items() if name in LAID)
     triangles = (standing(part)[part.mesh.faces.astype(np.int64)] for part in laid)
     return max((height for corners in triangles for height in heights_over(corners, place)), default=0.0)
