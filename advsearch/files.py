@@ -10,7 +10,7 @@ import json
 import math
 import os
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -126,6 +126,22 @@ def read_text(path: Path, expected: str, limit: int) -> str:
         return read_bytes(path, expected, limit).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise FileFormatError(f"{path}: expected {expected} in UTF-8, got bytes that are not text") from None
+
+
+def present_text(path: Path | str, expected: str, limit: int) -> str:
+    """Return what `read_text` returns, and raise FileFormatError where it raises OSError, too."""
+    try:
+        return read_text(Path(path), expected, limit)
+    except OSError as error:
+        raise FileFormatError(f"{path}: expected {expected}, got {error.strerror}; check the path") from None
+
+
+def parsed(path: Path | str, text: str, kind: str, parse: Callable[[str], Any]) -> Any:
+    """Return what the text of a file says. Raises FileFormatError where it is not of its kind, such as "JSON"."""
+    try:
+        return parse(text)
+    except (ValueError, SyntaxError) as error:  # that of XML is a SyntaxError
+        raise FileFormatError(f"{path}: expected {kind}, got {error}; correct the file") from None
 
 
 def parse_json(text: str | bytes, *, finite: bool = False) -> Any:

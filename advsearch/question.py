@@ -45,24 +45,18 @@ TYPES = {
 """What Python may give for a setting in place of its text."""
 
 
-class Asked(Generic[Settings]):
+class Asked(ExitStack, Generic[Settings]):
     """What a question is asked: its settings, who watches, and the folder of a run that goes on."""
 
     def __init__(self, config: Settings, progress: Progress | None = None, resumed: Path | None = None) -> None:
+        super().__init__()
         self.config, self.progress, self.resumed = config, progress or NullProgress(), resumed
-        self.ending = "done"
-        self._begun, self._open = time.perf_counter(), ExitStack()
-
-    def __enter__(self) -> Asked[Settings]:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._open.__exit__(*error)
+        self.ending, self._begun = "done", time.perf_counter()
 
     @cached_property
     def run(self) -> RunDirectory:
         """The run, made where it is first asked for: whatever may be wrong is looked for before."""
-        return self._open.enter_context(RunDirectory.of(self.config, self.resumed))
+        return self.enter_context(RunDirectory.of(self.config, self.resumed))
 
     @contextmanager
     def until_interrupted(self) -> Iterator[None]:

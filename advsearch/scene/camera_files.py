@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 from advsearch.errors import FileFormatError
-from advsearch.files import MESHES, parse_json, read_text
+from advsearch.files import MESHES, parse_json, parsed, present_text
 from advsearch.scene.camera_entries import Entries, made, nothing, number, plain, with_told
 from advsearch.scene.camera_model import BROWN_CONRADY, COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, CameraModel
 from advsearch.scene.importing.files import shown
@@ -80,7 +80,7 @@ def read_camera(spec: str) -> CameraModel:
         raise FileFormatError(f"{path}: expected a camera as text, got {CAMERAS[ending]}")
     if ending in MESHES:
         raise FileFormatError(f"{path}: expected a camera file, got a mesh; it is an object's, not a camera's")
-    text = camera_text(path, LARGEST_JSON if ending == ".json" else LARGEST)
+    text = present_text(path, "a camera file", LARGEST_JSON if ending == ".json" else LARGEST)
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
         return _of_colmap(spec, path, which, lines)
@@ -134,22 +134,6 @@ def _data(path: str, text: str) -> dict[str, Any]:
             "one of each"
         )
     return data
-
-
-def camera_text(path: str, most: int, what: str = "a camera file") -> str:
-    """Return the text of a file of at most so many bytes. Raises FileFormatError: it is missing, or no such text."""
-    try:
-        return read_text(Path(path), what, most)
-    except OSError as error:
-        raise FileFormatError(f"{path}: expected {what}, got {error.strerror}; check the path") from None
-
-
-def parsed(path: str, text: str, kind: str, parse: Callable[[str], Any]) -> Any:
-    """Return what the text of a file says. Raises FileFormatError: it is not of its kind."""
-    try:
-        return parse(text)
-    except (ValueError, ElementTree.ParseError) as error:
-        raise FileFormatError(f"{path}: expected {kind}, got {error}; correct the file") from None
 
 
 def _chosen(path: str, which: str, cameras: Mapping[str, Any]) -> Any:

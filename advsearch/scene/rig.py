@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import FileFormatError
-from advsearch.files import parse_json, read_text
+from advsearch.files import parse_json, parsed, present_text, read_text
 from advsearch.scene.assets import Doubles
-from advsearch.scene.camera_files import LARGEST_JSON, OF_A_FRAME, camera_text, parsed, read_camera
+from advsearch.scene.camera_files import LARGEST_JSON, OF_A_FRAME, read_camera
 from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.geometry import rotation
 from advsearch.scene.skeleton import entries_of_turn
@@ -139,7 +139,7 @@ def _of_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
 
 
 def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
-    data = parsed(path, camera_text(path, LARGEST_JSON), "JSON", parse_json)
+    data = parsed(path, present_text(path, "a camera file", LARGEST_JSON), "JSON", parse_json)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise FileFormatError(f"{path}: expected `frames`, a list with a camera each, as nerfstudio writes it")
@@ -159,7 +159,7 @@ def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
 def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
     """COLMAP's images.txt: in every second line a rotation (quaternion, real part first) and a shift from the world to
     the camera, whose model is in the cameras.txt beside it."""
-    text = camera_text(path, MOST_BYTES, "COLMAP's images")
+    text = present_text(path, "COLMAP's images", MOST_BYTES)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     rows = {words[0]: words for line in lines[::2] if (words := line.split(maxsplit=9))}
     if not rows:

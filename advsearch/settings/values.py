@@ -16,7 +16,7 @@ from pydantic import ValidationInfo, field_validator
 
 from advsearch.distributions import OwnQuantiles
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import read_text
+from advsearch.files import parsed, present_text
 from advsearch.yaml_text import LARGEST, parse_yaml
 
 LARGEST_WHOLE = 2**63 - 1
@@ -169,12 +169,7 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
     """Return the mapping in the YAML file at `path`, laid over the files that its `base` names; `above` are those that
     have named it as theirs. A base is a file, relative to this one, or a list of files of which a later one goes over
     an earlier one; mappings are merged. Raises FileFormatError: it is missing, not YAML or no mapping from names."""
-    try:
-        data = parse_yaml(read_text(Path(path), "a YAML file", LARGEST))
-    except OSError as error:
-        raise FileFormatError(f"{path}: expected a YAML file, got {error.strerror}; check the path") from None
-    except ValueError as error:
-        raise FileFormatError(f"{path}: expected YAML, got {error}; correct the file") from None
+    data = parsed(path, present_text(path, "a YAML file", LARGEST), "YAML", parse_yaml)
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
         got = "an empty file" if data is None else type(data).__name__
         raise FileFormatError(f"{path}: expected settings and values such as 'object: mug', got {got}")
