@@ -78,10 +78,10 @@ class Asked(ExitStack, Generic[Settings]):
 
 
 def carried_out(function: Callable[[Asked[Settings]], AnyResult], asked: Asked[Settings]) -> AnyResult:
-    """Return the result of a function, kept in its run with page and figure, unless the function has kept it."""
+    """Return the result of a function, which is kept in its run with its page and its figure."""
     with asked:
         result = function(asked)
-        if "run" not in vars(asked):
+        if "run" not in vars(asked):  # else the function has kept it itself
             return result
         for suffix, data in result_figure(shown(result)).items():
             write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
@@ -121,8 +121,8 @@ class Question(Generic[AnyResult]):
     examples: tuple[str, ...]  # lines of a shell, for its help
     place: tuple[str, ...] = ()  # settings that Python takes by position
     about: str = ""  # the setting that names a run or a file which it is about
-    # where that is given without its flag, what stands for it in the help, and what an error says it is; as further
-    # fields of `cli.main.Positional`, what the help adds, and whether there may be several
+    # where that is given without its flag, what stands for it in the help, and what an error says it is; perhaps what
+    # the help adds, and whether there may be several
     expected: tuple[Any, ...] | None = None
     # returns settings that the `run.yaml` of that run brings, by what was typed
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None
@@ -168,15 +168,15 @@ class Question(Generic[AnyResult]):
         return asks(self.config)(function)
 
 
-def question(*examples: str, **said: Any) -> Callable[[Callable[..., AnyResult]], Question[AnyResult]]:
-    """Make a `Question` of a function ``(asked: Asked[NameConfig]) -> NameResult`` that is called as its command: with
-    examples for its help, and what else is said of it, by the names of its fields."""
+def question(*examples: str, **fields: Any) -> Callable[[Callable[..., AnyResult]], Question[AnyResult]]:
+    """Make a `Question` of a function ``(asked: Asked[NameConfig]) -> NameResult`` that is called as its command, with
+    examples for its help and further fields of `Question` by their names."""
 
     def decorate(function: Callable[..., AnyResult]) -> Question[AnyResult]:
         hints = get_type_hints(function)
         first, result = next(iter(inspect.signature(function).parameters)), hints["return"]
         (config,) = get_args(hints[first])
         result = (*get_args(result), result)[0]  # the first of several kinds
-        return Question(function, config, result, examples, **said)
+        return Question(function, config, result, examples, **fields)
 
     return decorate
