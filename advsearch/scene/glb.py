@@ -193,10 +193,9 @@ def _levels(color: Floats) -> Levels:
 
 
 def _cut_out_png(color: Levels, opacity: Levels) -> bytes:
-    file, picture = io.BytesIO(), Image.fromarray(color)
+    picture = Image.fromarray(color)
     picture.putalpha(Image.fromarray(opacity).resize(picture.size, Image.Resampling.BILINEAR))
-    picture.save(file, "PNG")
-    return file.getvalue()
+    return png_of(np.asarray(picture))
 
 
 def _jpeg(color: Levels) -> bytes:
