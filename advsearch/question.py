@@ -89,16 +89,9 @@ def carried_out(function: Callable[[Asked[Settings]], AnyResult], asked: Asked[S
 
 
 def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path | None = None) -> Result:
-    """Ask the question that a configuration asks, and keep the run in a directory.
-
-    Args:
-        config: of any command.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with; None for a new run.
-
-    Raises:
-        InputError: anything that whoever asked can put right; nothing is written then.
-    """
+    """Ask the question that the configuration of any command asks, and keep the run in a directory; `progress` is told
+    how far it is, and `resumed` is the folder of a run to go on with, None for a new one. Raises InputError: anything
+    that whoever asked can put right; nothing is written then."""
     from advsearch.api.names import check_names  # imports scipy
 
     check_names(config)

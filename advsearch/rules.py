@@ -69,10 +69,6 @@ def is_shown(rows: pd.DataFrame) -> Mask:
     return np.asarray(rows["label"] != OUT_OF_VIEW)
 
 
-def is_independent(table: pd.DataFrame) -> bool:
-    return bool(table["unit"].is_unique)
-
-
 def interval_of(table: pd.DataFrame) -> tuple[float, float]:
     """Return the 95 % interval of the share of right predictions, over units; 0 to 1 where there is no row."""
     if table.empty:
@@ -221,7 +217,7 @@ def _best(table: pd.DataFrame, seed: int) -> RuleConditions:
     """The candidate of the largest weighted relative accuracy, as short as it can be; none where all are worthless."""
     wrong = ~table["correct"].to_numpy()
     least = max(LEAST_ROWS, round(LEAST_SHARE * len(table)))
-    if not is_independent(table):
+    if not table["unit"].is_unique:
         least = max(least, round(LEAST_UNITS * len(table) / table["unit"].nunique()))
     if len(table) < 2 * least or not 0 < int(wrong.sum()) < len(table):
         return ()

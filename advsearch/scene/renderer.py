@@ -78,7 +78,6 @@ class Renderer:
 
     Attributes:
         start: (d,) float32 in [0, 1], the configuration that leaves the scene as it is.
-        formation: how radiance becomes the picture.
         plan: how each coordinate is differentiated; may be replaced.
         routes: which scene inputs each group of coordinates reaches, by `control.parameter`.
         renders: number of primal renders so far, those of differences included.
@@ -147,15 +146,10 @@ class Renderer:
         predict: Predict | None = None,
         **formation: Any,
     ) -> Renderer:
-        """Return a renderer of the same space that counts on from this one's counters, by itself.
-
-        Args:
-            scene: in place of this one's.
-            source: another program, which renders and denoises.
-            predict: what predicts radiance (`scene.predictor`): seed and samples of a call mean nothing then, and every
-                derivative runs back through scene inputs, whatever the plan says.
-            formation: other fields of the image formation.
-        """
+        """Return a renderer of the same space that counts on from this one's counters, by itself: with another scene,
+        other fields of the image formation, a `source` (another program, which renders and denoises), or what predicts
+        radiance (`scene.predictor`): seed and samples of a call mean nothing then, and every derivative runs back
+        through scene inputs, whatever the plan says."""
         other = copy.copy(self)
         other.formation = replace(self.formation, **formation)
         other.scene, other._source = scene or self.scene, source or self._source
@@ -237,18 +231,10 @@ class Renderer:
     def gradient(
         self, loss: Callable[[Tensor], Tensor], u: Tensor, seed: int, spp: int, *, free: bool = False
     ) -> tuple[Tensor, Tensor]:
-        """Return the loss of a picture and its derivative with respect to u, by the plan.
-
-        Unlike autograd through a call, this gives coordinates with the estimator "secant" differences of the loss.
-
-        Args:
-            loss: from (H, W, 3) sRGB to a number.
-            u, seed, spp: (d,) in [0, 1]; as in a call.
-            free: leave out what takes primal renders of its own; zero for coordinates that use differences.
-
-        Returns:
-            The loss, without graph, and (d,) float32.
-        """
+        """Return the loss, from (H, W, 3) sRGB to a number, of the picture of u (d,), without graph, and its derivative
+        (d,) float32 by the plan; u, seed and spp as in a call. Unlike autograd through a call, this gives coordinates
+        with the estimator "secant" differences of the loss; `free` leaves out what takes primal renders of its own,
+        with zero for coordinates that use differences."""
         self._left_out = BY_DIFFERENCES if free else frozenset({"secant"})
         try:
             with torch.inference_mode(False), torch.enable_grad():
