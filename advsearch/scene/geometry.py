@@ -42,18 +42,19 @@ DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
 def framing_distance(description: SceneDescription, fov: Tensor, aspect: float) -> Tensor:
     """Return the distance of the camera to the middle of a scene's object, () float64 in object sizes, for a field of
     view () along the larger side of the picture, degrees, and its width over height; differentiable in the first."""
-    offsets, edge = _offsets(description).to(fov.device), _edge(description, fov, aspect)
+    offsets = torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description)).to(fov.device)
+    model = description.camera_model
+    if model is not None and model.name:  # of what it shows, a rectangle
+        edge = torch.tensor(model.tangents, dtype=torch.float64, device=fov.device)
+    else:
+        shape = torch.tensor([min(1.0, aspect), min(1.0, 1.0 / aspect)], dtype=torch.float64, device=fov.device)
+        edge = torch.tan(torch.deg2rad(fov.double()) / 2.0) * shape
     azimuth, elevation, roll = (float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW)
-    fits = _from_one_side(offsets, camera_axes(azimuth, elevation, roll), edge * FRAME_FILL)
+    axes = torch.from_numpy(camera_axes(azimuth, elevation, roll)).T.to(offsets)
+    (left, up, outwards), (wide, high) = offsets.matmul(axes).unbind(dim=1), edge * FRAME_FILL
+    fits = (outwards + torch.maximum(left.abs() / wide, up.abs() / high)).max()
     whole = _from_all_around(offsets, elevation, edge)
     return torch.maximum(fits, whole).clamp_min(float(offsets.norm(dim=1).max()) + CLEARANCE)
-
-
-def filling_distance(description: SceneDescription) -> float:
-    """Return the distance at which the object just fits into a square picture from where this scene's camera looks."""
-    edge = _edge(description, torch.tensor(description.number("camera.fov"), dtype=torch.float64), 1.0)
-    axes = camera_axes(*(description.number(name) for name in DEFAULT_VIEW))
-    return float(_from_one_side(_offsets(description), axes, edge * FRAME_FILL))
 
 
 def camera_axes(azimuth: float, elevation: float, roll: float) -> Doubles:
@@ -73,24 +74,6 @@ def middle(description: SceneDescription) -> Doubles:
     """Return what the camera looks at: the middle (3,) of the object's bounding box in its default pose."""
     vertices = description.object.mesh.vertices.astype(np.float64)
     return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
-
-
-def _offsets(description: SceneDescription) -> Tensor:
-    return torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description))
-
-
-def _edge(description: SceneDescription, fov: Tensor, aspect: float) -> Tensor:
-    """Tangents of half the picture's width and height, (2,); of a lens, those of what it shows of a rectangle."""
-    model = description.camera_model
-    if model is not None and model.name:
-        return torch.tensor(model.tangents, dtype=torch.float64, device=fov.device)
-    shape = torch.tensor([min(1.0, aspect), min(1.0, 1.0 / aspect)], dtype=torch.float64, device=fov.device)
-    return torch.tan(torch.deg2rad(fov.double()) / 2.0) * shape
-
-
-def _from_one_side(offsets: Tensor, axes: Doubles, tangents: Tensor) -> Tensor:
-    left, up, outwards = offsets.matmul(torch.from_numpy(axes).T.to(offsets)).unbind(dim=1)
-    return (outwards + torch.maximum(left.abs() / tangents[0], up.abs() / tangents[1])).max()
 
 
 def _from_all_around(offsets: Tensor, elevation: float, tangents: Tensor) -> Tensor:
