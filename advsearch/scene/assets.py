@@ -172,6 +172,13 @@ def face_vectors(corners: Doubles) -> Doubles:
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
+def pose_of(linear: npt.ArrayLike, place: npt.ArrayLike) -> Doubles:
+    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place (3,)."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = linear, place
+    return pose
+
+
 def footing(points: Doubles) -> tuple[Doubles, float]:
     """Return the place (3,) in the middle below some points (N, 3), and their largest extent."""
     low, high = points.min(axis=0), points.max(axis=0)

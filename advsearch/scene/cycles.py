@@ -22,7 +22,7 @@ from torch import Tensor
 
 from advsearch import files
 from advsearch.errors import AdvsearchError, FileFormatError
-from advsearch.scene.assets import Material, Mesh, Shape
+from advsearch.scene.assets import Material, Mesh, Shape, pose_of
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
@@ -167,8 +167,7 @@ class Cycles:
         for lamp in scene.lamps.values():
             place, shape = np.eye(4), list[list[float]]()
             if isinstance(lamp, BallLamp):
-                ball = np.diag([lamp.radius] * 3 + [1.0])
-                ball[:3, 3] = lamp.place
+                ball = pose_of(lamp.radius * np.eye(3), lamp.place)
                 shape = values.get(f"{lamp.name}.ball", torch.from_numpy(ball)).double().tolist()
                 color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
             else:

@@ -21,7 +21,7 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Ints, face_vectors
 from advsearch.scene.color import LOW_END, linear_to_srgb, srgb_to_linear
-from advsearch.scene.geometry import NEAREST, camera_to_world, object_to_world, standing
+from advsearch.scene.geometry import NEAREST, camera_to_world, object_to_world, rotation, standing
 from advsearch.scene.grounds import paved
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import looked_up, pixels_in
@@ -216,9 +216,7 @@ def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
 def arriving(scene: SceneDescription) -> tuple[Doubles, Doubles, Doubles]:
     """Return unit directions (N, 3) to the environment's light, solid angles (N,), and radiance times these."""
     directions, solid, power = _arriving(scene.environment)
-    turn = math.radians(scene.number("environment.rotation"))
-    cosine, sine = math.cos(turn), math.sin(turn)
-    return directions @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]), solid, power
+    return directions @ rotation(scene.number("environment.rotation"), 0.0, 0.0).T, solid, power
 
 
 def _emitted(part: MeshPart, emission: Floats, place: Doubles) -> tuple[Doubles, Doubles]:

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Doubles
+from advsearch.scene.assets import Doubles, pose_of
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import ORBIT_CAMERA, POSE, SETTINGS
 
@@ -133,11 +133,9 @@ def _posed(places: Doubles, floor: float, pose: Mapping[str, float]) -> Doubles:
     middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
     linear = pose["scale"] * rotation(pose["yaw"], pose["pitch"], pose["roll"])
     lowest = float(((places - middle) @ linear.T)[:, 2].min())
-    matrix = np.eye(4)
-    matrix[:3, :3] = linear
-    matrix[:3, 3] = np.array([pose["x"], pose["y"], floor + pose["z"] - lowest]) - linear @ middle
-    matrix[:2, 3] += middle[:2]
-    return matrix
+    place = np.array([pose["x"], pose["y"], floor + pose["z"] - lowest]) - linear @ middle
+    place[:2] += middle[:2]
+    return pose_of(linear, place)
 
 
 def camera_to_world(description: SceneDescription, aspect: float | None = None) -> Doubles:
@@ -158,10 +156,7 @@ def camera_to_world(description: SceneDescription, aspect: float | None = None) 
         above = (height / description.metres - float(middle(description)[2])) / distance
         elevation = math.degrees(math.asin(min(max(above, -STEEPEST), STEEPEST)))
     axes = camera_axes(number("camera.azimuth"), elevation, number("camera.roll"))
-    matrix = np.eye(4)
-    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = axes[0], axes[1], -axes[2]
-    matrix[:3, 3] = middle(description) + distance * axes[2]
-    return matrix
+    return pose_of(np.stack([axes[0], axes[1], -axes[2]], axis=1), middle(description) + distance * axes[2])
 
 
 def projected(

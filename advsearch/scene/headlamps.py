@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Doubles, Floats, Ints, Material, Mesh, face_vectors
+from advsearch.scene.assets import Doubles, Floats, Ints, Material, Mesh, face_vectors, pose_of
 from advsearch.scene.grounds import LUMINANCE
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart, ScenePart
 from advsearch.scene.settings import LAMPS
@@ -129,8 +129,7 @@ def _lamps_of(scene: SceneDescription, carrier: str, kind: str, unit: float, wei
             places.append(np.array([high[0] + 5.0 * OUT * step, *(low + high)[1:] / 2.0]))
     red, green, blue = map(float, WHITE / (unit * scene.metres**2))
     for name, place in zip(("left", "right"), places, strict=True):
-        seat = np.eye(4)
-        seat[:3] = np.stack([(0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), place], axis=1)
+        seat = pose_of([(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], place)
         yield BeamLamp(f"{carrier}-{name}-beam", carrier, seat, table(kind), (red, green, blue), weight)
 
 

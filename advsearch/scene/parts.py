@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles, Floats, Ints, Material, Shape
+from advsearch.scene.assets import Doubles, Floats, Ints, Material, Shape, pose_of
 
 Triple = tuple[float, float, float]
 BASE_COLOR = "base color"  # the type that stands for the texture in a surface in Mitsuba's words
@@ -111,9 +111,7 @@ class SpotLamp(_Point):
         ahead = np.array(self.direction) if any(self.direction) else np.array([0.0, 0.0, -1.0])
         aside = np.cross(np.eye(3)[np.abs(ahead).argmin()], ahead)
         aside /= np.linalg.norm(aside)
-        matrix = np.eye(4)
-        matrix[:3] = np.stack([aside, np.cross(ahead, aside), ahead, np.array(self.position)], axis=1)
-        return matrix
+        return pose_of(np.stack([aside, np.cross(ahead, aside), ahead], axis=1), self.position)
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
         way, faced = super().lighting(place)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from advsearch.errors import FileFormatError
 from advsearch.files import parse_json, parsed, present_text, read_text
-from advsearch.scene.assets import Doubles
+from advsearch.scene.assets import Doubles, pose_of
 from advsearch.scene.camera_files import LARGEST_JSON, OF_A_FRAME, read_camera
 from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.geometry import rotation
@@ -107,9 +107,8 @@ def _of_entry(spec: str, number: int, given: Any) -> Mount:
     if not isinstance(name, str) or not 0 < len(name) <= 40:
         raise FileFormatError(f"{where}: name: expected a short text, got {str(name)[:80]!r}")
     yaw, pitch, roll = _numbers(where, "turn", given.get("turn", [0.0] * 3), 3, 3600.0)
-    pose = np.eye(4)
-    pose[:3, :3] = rotation(0.0, yaw, 0.0) @ rotation(0.0, 0.0, pitch) @ rotation(roll, 0.0, 0.0)  # about y, x and z
-    pose[:3, 3] = _numbers(where, "place", given.get("place", [0.0] * 3), 3, FARTHEST)
+    turn = rotation(0.0, yaw, 0.0) @ rotation(0.0, 0.0, pitch) @ rotation(roll, 0.0, 0.0)  # about y, x and z
+    pose = pose_of(turn, _numbers(where, "place", given.get("place", [0.0] * 3), 3, FARTHEST))
     (around,) = _numbers(where, "around", [given.get("around", 0.0)], 1, 3600.0)
     fov = _numbers(where, "fov", [given["fov"]], 1, 170.0)[0] if "fov" in given else None
     if fov is not None and fov < 1.0:
@@ -182,10 +181,8 @@ def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
         w, x, y, z, *shift = _numbers(where, "pose", numbers, 7, FARTHEST)
         if not 0.99 < (length := math.sqrt(w * w + x * x + y * y + z * z)) < 1.01:
             raise FileFormatError(f"{where}: expected a quaternion of length 1, got one of {length:.3g}")
-        seen = np.eye(4)
-        seen[:3, :3] = np.reshape(entries_of_turn(x / length, y / length, z / length, w / length), (3, 3))
-        seen[:3, 3] = shift
-        poses.append(np.asarray(np.linalg.inv(seen), np.float64))
+        turn = np.reshape(entries_of_turn(x / length, y / length, z / length, w / length), (3, 3))
+        poses.append(np.asarray(np.linalg.inv(pose_of(turn, shift)), np.float64))
         models.append(read_camera(f"{Path(path).with_name('cameras.txt')}#{words[8]}"))
     return _mounted(path, names, poses, models)
 

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import LARGEST, SMALLEST, Doubles, ObjectAsset, doubts, footing, sized
+from advsearch.scene.assets import LARGEST, SMALLEST, Doubles, ObjectAsset, doubts, footing, pose_of, sized
 from advsearch.scene.geometry import middle, rotation, standing
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.parts import MeshPart, mesh_part
@@ -145,11 +145,8 @@ def with_things(scene: SceneDescription, text: str | None, load: Callable[[str],
 def _pose(scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres: float) -> Doubles:
     foot, extent = footing(asset.mesh.vertices.astype(np.float64))
     linear = metres / scene.metres / extent * rotation(asked.heading, 0.0, 0.0)
-    matrix = np.eye(4)
-    matrix[:3, :3] = linear
     place = middle(scene)[:2] + np.array([asked.x, asked.y]) / scene.metres
-    matrix[:3, 3] = np.array([*place, ground_height(scene, place)]) - linear @ foot
-    return matrix
+    return pose_of(linear, np.array([*place, ground_height(scene, place)]) - linear @ foot)
 
 
 def ground_height(scene: SceneDescription, place: Doubles) -> float:
