@@ -358,7 +358,7 @@ SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
         "from advsearch.cli.main import main\n"
         "with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit): main(['--help'])\n"
         "assert 'attack' in text.getvalue()",
-        "from advsearch.registry import Room, rooms\nassert [Room(name).result for name in rooms()]",
+        "from advsearch.registry import part_of, rooms\nassert [part_of(name, 'result') for name in rooms()]",
     ],
     ids=["small modules", "rooms", "help", "questions"],
 )

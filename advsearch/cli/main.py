@@ -6,7 +6,6 @@ Exit status: 0 the command did its work, 1 a bug, 2 bad input, 3 a check that fe
 from __future__ import annotations
 
 import argparse
-import importlib
 import re
 import shutil
 import signal
@@ -23,7 +22,7 @@ from advsearch.cli import output
 from advsearch.cli.output import BAD_INPUT, INTERRUPTED, OK, at_work, end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
-from advsearch.registry import allow_code, made_question, made_questions, nothing_allowed, rooms
+from advsearch.registry import allow_code, imported, made_question, made_questions, nothing_allowed, rooms
 from advsearch.registry import help_of as help_of_question
 
 if TYPE_CHECKING:
@@ -111,8 +110,7 @@ class QuestionCommand:
         """Ask what the arguments say. Raises InputError where what it is about is missing."""
         named, (metavar, missing, _, _) = getattr(args, self.about, None), self.place
         if self.listed and named == "list":
-            module, _, function = self.listed.partition(":")
-            lines = getattr(importlib.import_module(module), function)()
+            lines = imported(self.listed)()
             listed = [{"name": name, "title": text} for name, text in lines.items()]
             return output.say(args.json, {f"{self.name}s": listed}, output.aligned([*lines.items()]))
         if metavar and named in (None, []):
@@ -193,12 +191,11 @@ COMMANDS = {name: place for group in GROUPS.values() for name, place in group.it
 def command_named(name: str) -> Any:
     """Return the `QuestionCommand` or `PlainCommand` of a name."""
     if COMMANDS[name]:
-        place, _, attribute = COMMANDS[name].partition(" ")[0].partition(":")
-        return getattr(importlib.import_module(f"advsearch.cli.{place}"), attribute)
+        return imported(f"advsearch.cli.{COMMANDS[name].partition(' ')[0]}")
     if made := made_question(name):
         same = ("short", "about", "expected", "brought", "listed", "more", "examples")
         return QuestionCommand(name, **{attribute: getattr(made, attribute) for attribute in same})
-    return importlib.import_module(f"advsearch.questions.{name}").COMMAND
+    return imported(f"advsearch.questions.{name}:COMMAND")
 
 
 def help_of(name: str) -> str:

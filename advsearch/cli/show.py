@@ -6,7 +6,6 @@ And what `advsearch render` says: a picture of a scene, or a sheet of views arou
 from __future__ import annotations
 
 import argparse
-import importlib
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +20,7 @@ from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
-from advsearch.registry import allow_named, there
+from advsearch.registry import allow_named, imported, there
 from advsearch.report.wording import SEEN, count, interval_text, seen_cells, seen_text, things_rows
 from advsearch.runs.directory import IMAGES, find_run
 from advsearch.runs.listing import Listed, listed_run
@@ -300,8 +299,7 @@ def list_names(kind: str) -> dict[str, str]:
 
 
 def _registry(kind: str) -> Any:
-    module, _, attribute = REGISTRIES[kind].partition(":")
-    registry = getattr(importlib.import_module(module), attribute)
+    registry = imported(REGISTRIES[kind])
     return registry() if callable(registry) else registry
 
 

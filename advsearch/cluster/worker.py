@@ -5,7 +5,6 @@ files in it and below of the kinds that a scene consists of."""
 from __future__ import annotations
 
 import hashlib
-import importlib
 import json
 import os
 import pickle
@@ -28,7 +27,7 @@ from advsearch import threads  # before torch: it sets how OpenMP waits
 from advsearch.cluster import Call, Work
 from advsearch.errors import AdvsearchError, EnvironmentSetupError, InputError, StorageError
 from advsearch.files import split_paths
-from advsearch.registry import allow_code
+from advsearch.registry import allow_code, imported
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 
 _CPU_INFO = Path("/proc/cpuinfo")
@@ -230,8 +229,7 @@ def own_folder() -> Path:
 def _call_of(key: str) -> Call:
     work = _known[key]
     threads.configure(work.threads)
-    module, _, name = work.function.partition(":")
-    make: Callable[[Any], Call] = getattr(importlib.import_module(module), name)
+    make: Callable[[Any], Call] = imported(work.function)
     return make(work.settings)
 
 

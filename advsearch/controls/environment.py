@@ -146,7 +146,7 @@ def _is_own(name: Number, scene: SceneDescription) -> bool:
     """Whether an environment is the scene's own."""
     own = scene.environment
     if own is None or not _is_file(name):
-        return name == scene.bundled_environment is not None
+        return own is not None and own.source == library.BUNDLED_ENVIRONMENT and own.name == name
     return bool(own.source) and os.path.realpath(str(name)) == os.path.realpath(own.source)
 
 

@@ -26,13 +26,11 @@ from advsearch.scene.geometry import camera_to_world, driving, projected, seated
 from advsearch.scene.gradients import Group
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart
 
-ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})
-"""Inputs that Mitsuba never sees: the renderer applies them to radiance."""
+ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})  # inputs that the renderer applies to radiance
 
 
 class MovingMesh:
-    """One mesh, in its own coordinates, whose vertices and normals follow a pose, (4, 4) `to_world` at first, and a
-    displacement."""
+    """One mesh, in its own coordinates, whose vertices and normals follow a pose (4, 4) and a displacement."""
 
     def __init__(self, mesh: Mesh, to_world: np.ndarray) -> None:
         self._mesh = mesh
@@ -92,15 +90,13 @@ AWAY = 1000.0  # object sizes to the side, where a thing is under a pixel wide
 
 
 class Assembly:
-    """Turns the inputs of a space into those of `MitsubaScene`, for a scene with all its parts.
+    """Turns the inputs of a space into those of `MitsubaScene`, for a scene with all its parts."""
 
-    Attributes:
-        away: whether the object is put so far away that neither it nor its shadow is in the picture. A scene in which
-            it was so has bounds from then on that change last bits of every picture: it is for such pictures alone.
-    """
+    # whether the object is put so far away that neither it nor its shadow is in the picture. A scene in which it was so
+    # has bounds from then on that change last bits of every picture: it is for such pictures alone
+    away = False
 
     def __init__(self, description: SceneDescription) -> None:
-        self.away = False
         self.meshes = {name: MovingMesh(part.mesh, part.to_world) for name, part in description.meshes.items()}
         self._carried = [part for part in description.parts if isinstance(part, (BeamLamp, LampGlass))]
         self._photograph = description.photograph
@@ -113,13 +109,14 @@ class Assembly:
             inputs = {**inputs, f"{OBJECT}.to_world": pose}
         parameters = dict(inputs)
         for part in self._carried:  # what carries it may be moved or deformed
-            pose, offsets = (inputs.get(f"{part.carrier}.{what}") for what in ("to_world", "offsets"))
+            carrier, offsets = (inputs.get(f"{part.carrier}.{what}") for what in ("to_world", "offsets"))
             if isinstance(part, LampGlass) and offsets is not None:
                 parameters[f"{part.name}.offsets"] = offsets[torch.from_numpy(part.follows).to(offsets.device)]
-            if pose is not None and isinstance(part, BeamLamp):
-                pose = seated(driving(pose) if part.carrier == CAMERA else pose, torch.from_numpy(part.seat).to(pose))
-            if pose is not None:
-                parameters[f"{part.name}.to_world"] = pose
+            if carrier is not None and isinstance(part, BeamLamp):
+                car = driving(carrier) if part.carrier == CAMERA else carrier
+                carrier = seated(car, torch.from_numpy(part.seat).to(carrier))
+            if carrier is not None:
+                parameters[f"{part.name}.to_world"] = carrier
         for name, mesh in self.meshes.items():
             to_world, offsets = parameters.pop(f"{name}.to_world", None), parameters.pop(f"{name}.offsets", None)
             if to_world is not None or offsets is not None:

@@ -73,14 +73,11 @@ class GlbBuffer:
 Levels = npt.NDArray[np.uint8]
 COAT_ROUGHNESS = 0.316  # of Mitsuba's clearcoat, whose alpha is 0.1: the square root of it
 PLAIN = 0.5  # specular of a surface whose index of refraction is 1.5
-WEB_SIDE, WEB_QUALITY = 1024, 90
-"""Longest side in pixels of a texture in a file for the web, and the quality of its JPEG, from 1 to 95."""
-CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
-"""The camera of such a file: its place counts."""
+WEB_SIDE, WEB_QUALITY = 1024, 90  # longest side of a texture in a file for the web, and the quality of its JPEG
+CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}  # its place counts
 
 
 def glb(meshes: Sequence[Shape]) -> bytes:
-    """Return a binary glTF file of some meshes."""
     made = GlbBuffer()
     return made.file(_described(made, meshes, png_of))
 
@@ -127,9 +124,8 @@ def _described(made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Leve
         }
         whole = np.uint32 if len(mesh.vertices) > np.iinfo(np.uint16).max else np.uint16
         indices = made.accessor(mesh.faces.reshape(-1).astype(whole), "SCALAR")
-        header["meshes"].append(
-            {"name": shape.name, "primitives": [{"attributes": corners, "indices": indices, "material": number}]}
-        )
+        primitive = {"attributes": corners, "indices": indices, "material": number}
+        header["meshes"].append({"name": shape.name, "primitives": [primitive]})
         levels = _levels(shape.base_color)
         encoded = picture(levels) if shape.opacity is None else _cut_out_png(levels, _levels(shape.opacity))
         material = _material(shape, _texture(header, made, encoded))
@@ -179,10 +175,9 @@ def _levels(color: Floats) -> Levels:
 
 
 def _cut_out_png(color: Levels, opacity: Levels) -> bytes:
-    file, picture = io.BytesIO(), Image.fromarray(color)
+    picture = Image.fromarray(color)
     picture.putalpha(Image.fromarray(opacity).resize(picture.size, Image.Resampling.BILINEAR))
-    picture.save(file, "PNG")
-    return file.getvalue()
+    return png_of(np.asarray(picture))
 
 
 def _jpeg(color: Levels) -> bytes:

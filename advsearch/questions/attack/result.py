@@ -315,7 +315,7 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
         vertices = shapes[OBJECT].mesh.vertices
         middle, reach = vertices.mean(axis=0), NEAR * float(np.ptp(vertices, axis=0).max())
         near = [one for one in shapes.values() if np.abs(one.mesh.vertices.mean(axis=0) - middle).max() < reach]
-        return [replace(one, mesh=left.of(one.mesh)) if (left := fewer[one.name]) else one for one in near]
+        return [replace(one, mesh=left(one.mesh)) if (left := fewer[one.name]) else one for one in near]
 
     camera = after.get("camera.to_world")
     pose = camera_to_world(scene) if camera is None else camera.double().numpy()
