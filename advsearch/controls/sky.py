@@ -21,8 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, number
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Values, number
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -148,31 +147,21 @@ METERED_IRRADIANCE = 0.9 * math.pi / 0.8
 """`M`: the irradiance on what faces the sun, the same for every sky that is metered."""
 
 
-class SkyControl(NumberControl):
-    """A sun and a clear sky in place of the environment."""
+class SkyControl(Control):
+    """A clear sky instead of the environment: where the sun stands, and how hazy the air is."""
 
     kind = "sky"
-    summary = "A clear sky instead of the environment: where the sun stands, and how hazy the air is."
     parameters = (
-        number(
-            ("differences",), "azimuth", "degrees", -3600.0, 3600.0, 90.0,
-            "Direction of the sun about the vertical; 0 is +x.", (0.0, 360.0), periodic=True,
-        ),
-        number(
-            ("differences",), "elevation", "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.",
-            (5.0, 85.0),
-        ),
-        number(
-            LIT, "turbidity", "1", *TURBIDITIES, 3.0,
-            "How much the air scatters: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.", (2.0, 8.0),
-        ),
+        number(("differences",), "azimuth", "degrees", -3600.0, 3600.0, 90.0,
+               "Direction of the sun about the vertical; 0 is +x.", (0.0, 360.0), periodic=True),
+        number(("differences",), "elevation", "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.",
+               (5.0, 85.0)),
+        number(LIT, "turbidity", "1", *TURBIDITIES, 3.0,
+               "How much the air scatters: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.", (2.0, 8.0)),
     )  # fmt: skip
-    choices = (
-        Choice(
-            "exposure", "metered", "metered (each sky anew, as an automatic camera does) or fixed (at the start).",
-            options=("metered", "fixed"),
-        ),
-    )  # fmt: skip
+    choices = (Choice("exposure", "metered",
+                      "metered (each sky anew, as an automatic camera does) or fixed (at the start).",
+                      options=("metered", "fixed")),)  # fmt: skip
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         bound = self.bind(scene)
