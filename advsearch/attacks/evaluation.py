@@ -106,30 +106,29 @@ class Evaluation:
         """Whether the objective is a number that can be compared."""
         return math.isfinite(self.objective)
 
+    def usable(self) -> Evaluation:
+        """Return the evaluation as policies may see it: every number in it can be computed with.
+
+        The rule, the same for every policy:
+
+        - gradient elements that are NaN or infinite become zero and are added to `non_finite`;
+        - an objective that is NaN or infinite becomes -inf ("the worst there is"), its gradient zero and its success
+          false.
+        """
+        evaluation, gradient = self, self.gradient
+        if gradient is not None and not math.isfinite(float(gradient.sum(dtype=torch.float64))):
+            if bad := int((~torch.isfinite(gradient)).sum()):
+                gradient = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
+                evaluation = replace(evaluation, gradient=gradient, non_finite=evaluation.non_finite + bad)
+        if evaluation.finite:
+            return evaluation
+        zero = None if gradient is None else torch.zeros_like(gradient)
+        return replace(evaluation, objective=-math.inf, gradient=zero, success=False)
+
 
 Evaluate = Callable[[Sequence[Query]], Iterable[Evaluation]]
 """Answers queries, in their order, each when it is asked for; whoever stops asking leaves the rest undone. Supplied by
 whoever owns the scene. `functools.partial(map, f)` makes one of a function of one query."""
-
-
-def usable(evaluation: Evaluation) -> Evaluation:
-    """Return the evaluation as policies may see it: every number in it can be computed with.
-
-    The rule, the same for every policy:
-
-    - gradient elements that are NaN or infinite become zero and are added to `non_finite`;
-    - an objective that is NaN or infinite becomes -inf ("the worst there is"), its gradient zero and its success
-      false.
-    """
-    gradient = evaluation.gradient
-    if gradient is not None and not math.isfinite(float(gradient.sum(dtype=torch.float64))):
-        if bad := int((~torch.isfinite(gradient)).sum()):
-            gradient = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
-            evaluation = replace(evaluation, gradient=gradient, non_finite=evaluation.non_finite + bad)
-    if evaluation.finite:
-        return evaluation
-    zero = None if gradient is None else torch.zeros_like(gradient)
-    return replace(evaluation, objective=-math.inf, gradient=zero, success=False)
 
 
 State = TypeVar("State")
@@ -156,6 +155,14 @@ class Proposal:
     def cost(self, domain: Domain) -> int:
         """Return the renders that this takes at most."""
         return self.samples * (1 + (domain.gradient_cost if self.gradient is True else 0))
+
+    def affordable(self, domain: Domain, left: int) -> Proposal:
+        """Return the proposal as far as `left` renders, at least 1, allow: no more samples than these, and no gradient
+        after which no render would be left to use it."""
+        proposal = replace(self, samples=left) if self.samples > left else self
+        if proposal.gradient and proposal.cost(domain) >= left:
+            return replace(proposal, gradient=False)
+        return proposal
 
 
 @dataclass(frozen=True)
@@ -253,16 +260,6 @@ class Policy(ABC, Generic[State]):
     def failures(self, state: State) -> Failures | None:
         """Return the different failures that the policy has met, if it looks for more than one."""
         return None
-
-
-def affordable(proposal: Proposal, domain: Domain, left: int) -> Proposal:
-    """Return the proposal as far as `left` renders, at least 1, allow: no more samples than these, and no gradient
-    after which no render would be left to use it."""
-    if proposal.samples > left:
-        proposal = replace(proposal, samples=left)
-    if proposal.gradient and proposal.cost(domain) >= left:
-        return replace(proposal, gradient=False)
-    return proposal
 
 
 def draw_seed(generator: torch.Generator) -> int:

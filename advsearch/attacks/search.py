@@ -14,19 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Candidate, Failures, admit, best, contenders, with_last
 from advsearch.attacks.domain import TOLERANCE, Distribution, Domain
-from advsearch.attacks.evaluation import (
-    NO_COUNTS,
-    Counts,
-    Evaluate,
-    Evaluation,
-    Phase,
-    Policy,
-    Proposal,
-    Query,
-    affordable,
-    most_at_once,
-    usable,
-)
+from advsearch.attacks.evaluation import Counts, Evaluate, Evaluation, Phase, Policy, Proposal, Query, most_at_once
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.attacks.verification import Ending
 from advsearch.copies import copied
@@ -83,7 +71,7 @@ class SearchResult:
     agreement: tuple[float, ...] = ()
     """Cosines of gradients with those before them, in their order: what noise and the way between left of them; none
     for gradients of zero."""
-    counts: Counts = NO_COUNTS  # what the policy had to do about gradients and steps
+    counts: Counts = field(default_factory=Counts)  # what the policy had to do about gradients and steps
     distribution: Distribution | None = None  # what the policy found beside `best_u`, if it finds a distribution
     failures: Failures | None = None  # what the policy knows of different failures, if it looks for them
 
@@ -113,7 +101,7 @@ def search(
 
     1. Until `steps` renders are spent: the policy proposes as many configurations as do not wait for each other; they
        are checked against the domain and evaluated, each with a new seed (docs/design.md, "The search"); the policy is
-       told. An evaluation costs `Proposal.cost` renders at most. What cannot be paid is not asked for (`affordable`).
+       told. An evaluation costs `Proposal.cost` renders at most. What cannot be paid is not asked for.
     2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seeds that are
        the same for all, without gradient. The best by these renders is what the search found (see `candidates`). With
        `candidates=0`, for an objective without noise, the raw best is what it found. Where evaluations draw conditions
@@ -182,7 +170,7 @@ def search(
         non_finite_elements=sum(record.non_finite for record in log.records),
         seconds=time.perf_counter() - begun,
         agreement=tuple(log.agreement),
-        counts=NO_COUNTS if started is None else started.counts(state),
+        counts=Counts() if started is None else started.counts(state),
         distribution=None if started is None else started.distribution(state),
         failures=None if started is None else started.failures(state),
     )
@@ -220,7 +208,7 @@ class _Log:
         for proposal, query, raw in zip(proposals, queries, self.evaluate(queries), strict=True):
             seconds = time.perf_counter() - begun
             _check_evaluation(raw, proposal, self.domain)
-            evaluation = usable(raw)
+            evaluation = raw.usable()
             self.gradients += bool(proposal.gradient)
             self.renders += raw.cost
             if not evaluation.finite:
@@ -275,7 +263,7 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
             _check_inside(proposal, log.domain, name)
             if left > 0:
                 own = replace(proposal, u=proposal.u.clone())  # a policy may write into its own later
-                batch.append(affordable(own, log.domain, left))
+                batch.append(own.affordable(log.domain, left))
                 left -= batch[-1].cost(log.domain)
         log.state, log.told, over, first = state, [], False, len(log.records)
         evaluations = log.evaluated(batch, range(first, first + len(batch)), "search")

@@ -25,20 +25,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.controls.ranges import (
-    Fixed,
-    Number,
-    OneOf,
-    Range,
-    Slot,
-    Spec,
-    in_words,
-    is_number,
-    plain,
-    read,
-    same,
-    shown,
-)
+from advsearch.controls.ranges import Fixed, Number, OneOf, Range, Slot, Spec, is_number, plain, read, same, shown
 from advsearch.copies import copied, hand_copies, is_ours
 from advsearch.described import Value as Value
 from advsearch.described import rounded
@@ -434,7 +421,7 @@ class Control:
                 if setting != ENVIRONMENT:
                     asked = f"`set` {setting}={shown(self.scene.number(setting))}"
                 raise InputError(
-                    f"{asked} and `controls` {self.name} contradict each other: {where} is {in_words(slot.spec)}, "
+                    f"{asked} and `controls` {self.name} contradict each other: {where} is {slot.spec}, "
                     f"which leaves {shown(wanted)} out; change one of the two, or leave one out"
                 )
             if not isinstance(self.specs.get(parameter.name), Fixed):
@@ -594,7 +581,7 @@ def measure(value: Tensor | float, unit: str) -> Value:
     return {"value": float(value), "unit": unit}
 
 
-def change_in_colour(name: str, change: Tensor) -> dict[str, Value]:
+def changed(name: str, change: Tensor) -> dict[str, Value]:
     """Say a change of searched colours, display-referred: the largest, and the root of the mean square."""
     root_mean_square = change.square().mean().sqrt()
     return {f"{name}.linf": measure(change.abs().max(), "sRGB"), f"{name}.rms": measure(root_mean_square, "sRGB")}

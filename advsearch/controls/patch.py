@@ -26,31 +26,19 @@ import torch.nn.functional as F
 from scipy import spatial
 from torch import Tensor
 
-from advsearch.controls.base import (
-    LARGEST_EPSILON,
-    NOTHING,
-    WHOLE_RANGE,
-    Budget,
-    Choice,
-    Control,
-    Moved,
-    Parameter,
-    Value,
-    Values,
-    change_in_colour,
-    number,
-)
+from advsearch.controls.base import LARGEST_EPSILON, NOTHING, Choice, Control, Moved, Value, Values, changed, number
 from advsearch.controls.corruption_filters import picture, planes, resized
-from advsearch.controls.ranges import Fixed, OneOf, Range, Slot, Spec, in_words
+from advsearch.controls.ranges import Fixed, OneOf, Range, Slot, Spec
 from advsearch.controls.texture import radius, resampled
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import Doubles, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.gradients import WHOLE_RANGE, Budget
 from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.raster import MeshSurface, rasterised
-from advsearch.scene.settings import LIT
+from advsearch.scene.settings import LIT, Parameter
 
 BASE_COLOR = "object.base_color"
 NORMS = ("box", "linf", "l2")
@@ -108,7 +96,7 @@ class PictureControl(Control):
         if not self.free:
             return described
         here, start = (self.values(at)[self.shown] for at in (u.detach(), self.start.to(u.device)))
-        return {**change_in_colour(self.name, here - start), **described}
+        return {**changed(self.name, here - start), **described}
 
 
 class PatchControl(PictureControl):
@@ -181,7 +169,8 @@ class PatchControl(PictureControl):
             return WHOLE_RANGE
         spec = self.spec(parameter)
         assert isinstance(spec, Range)
-        return Budget(norm, radius(norm, self.chosen["epsilon"], math.prod(parameter.shape)) / (spec.high - spec.low))
+        reach = radius(norm, self.chosen["epsilon"], 3 * math.prod(self.sides))
+        return Budget(norm, reach / (spec.high - spec.low))
 
     def fit(self) -> None:
         super().fit()
@@ -199,7 +188,7 @@ class PatchControl(PictureControl):
             wanted = (self._sticker.underneath() - low) / (high - low)
             self.start[: pixels.width] = wanted.clamp(0.0, 1.0).reshape(-1)
             moved = not torch.allclose(wanted.clamp(0.0, 1.0), wanted, atol=1e-5)
-            nearest = f"the nearest {in_words(pixels.spec)}"
+            nearest = f"the nearest {pixels.spec}"
             self.moved = (Moved(self.name, f"{self.name}.pixels", "sRGB", "the texture underneath", nearest),) * moved
 
     def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:

@@ -23,17 +23,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.controls.base import (
-    LARGEST_EPSILON,
-    WHOLE_RANGE,
-    Budget,
-    Choice,
-    Parameter,
-    Value,
-    Values,
-    measure,
-    number,
-)
+from advsearch.controls.base import LARGEST_EPSILON, Choice, Value, Values, measure, number
 from advsearch.controls.corruption_filters import picture, planes
 from advsearch.controls.patch import PRINT_SIDE, PictureControl, enlarged
 from advsearch.controls.ranges import Fixed, Range
@@ -43,8 +33,9 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import METERED_WHITE, WHITE, metered_gain, to_8_bit
 from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middle
+from advsearch.scene.gradients import WHOLE_RANGE, Budget
 from advsearch.scene.parts import ProjectorPart
-from advsearch.scene.settings import LIT, moving
+from advsearch.scene.settings import LIT, Parameter, moving
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -151,8 +142,8 @@ class ProjectorControl(PictureControl):
             case "pattern":
                 return replace(parameter, default=GREY if self.chosen["start"] == "grey" else 0.0)
             case "ambient":
-                unit = None if scene.environment is None else scene.environment.candelas
-                lux = AMBIENT if unit is None else min(max(unit * ambient_irradiance(scene), 1e-3), 2e5)
+                candelas = None if scene.environment is None else scene.environment.candelas
+                lux = AMBIENT if candelas is None else min(max(candelas * ambient_irradiance(scene), 1e-3), 2e5)
                 return replace(parameter, default=lux)
             case "lumens":
                 bright = TIMES * float(self.resting("ambient")) * self.part.area * self._far() ** 2
@@ -178,7 +169,7 @@ class ProjectorControl(PictureControl):
     def budget_of(self, parameter: Parameter) -> Budget:
         if parameter.name != "pattern":
             return WHOLE_RANGE
-        norm, epsilon, count = self.chosen["norm"], self.chosen["epsilon"], math.prod(parameter.shape)
+        norm, epsilon, count = self.chosen["norm"], self.chosen["epsilon"], 3 * math.prod(self.sides)
         whole = 1.0 if norm == "linf" else math.sqrt(count)
         return Budget(norm, whole if epsilon is None else radius(norm, epsilon, count))
 

@@ -54,12 +54,18 @@ class Fixed:
 
     value: Number
 
+    def __str__(self) -> str:
+        return shown(self.value)
+
 
 @dataclass(frozen=True)
 class OneOf:
     """One of a few values: numbers or names."""
 
     values: tuple[Number, ...]
+
+    def __str__(self) -> str:
+        return f"one of {', '.join(map(shown, dict.fromkeys(self.values)))}"
 
     def at(self, u: Tensor) -> Number:
         """Return the value that a coordinate () chooses: each has an equal share of [0, 1]."""
@@ -72,6 +78,9 @@ class Range:
 
     low: float
     high: float
+
+    def __str__(self) -> str:
+        return f"from {self.low:g} to {self.high:g}"
 
     def at(self, u: Tensor, *, log: bool = False) -> Tensor:
         """Return the values at coordinates in [0, 1]; differentiable."""
@@ -236,15 +245,6 @@ def _value(where: str, parameter: Parameter, given: object) -> Number:
             f"got {shown(given)}"
         )
     return float(given)
-
-
-def in_words(spec: Spec) -> str:
-    """Say what a parameter is set to: ``10``, ``from 5 to 30``, ``one of noon, kitchen``."""
-    if isinstance(spec, Range):
-        return f"from {spec.low:g} to {spec.high:g}"
-    values = (spec.value,) if isinstance(spec, Fixed) else dict.fromkeys(spec.values)
-    written = ", ".join(map(shown, values))
-    return written if isinstance(spec, Fixed) else f"one of {written}"
 
 
 TURN = 360.0

@@ -20,22 +20,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import (
-    LARGEST_EPSILON,
-    NOTHING,
-    Budget,
-    Choice,
-    Control,
-    Group,
-    Parameter,
-    Value,
-    change_in_colour,
-)
+from advsearch.controls.base import LARGEST_EPSILON, NOTHING, Choice, Control, Parameter, Value, changed
 from advsearch.controls.corruption_filters import resized
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Bools, Floats
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription
+from advsearch.scene.gradients import Budget, Group
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import texel_area, texels_of_faces
 
@@ -170,7 +161,7 @@ class TextureControl(Control):
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         change = self._painter.texels(u.detach()) - self._unchanged.to(u.device)
         named: dict[str, Value] = {f"{self.name}.materials": {"value": self._materials, "unit": "name"}}
-        return (named if self._materials else {}) | change_in_colour(self.name, change)
+        return (named if self._materials else {}) | changed(self.name, change)
 
     def printed(self, u: Tensor) -> Tensor | None:
         texels = self._texels(u)
