@@ -20,7 +20,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, Control, Parameter, Value, Values, measure, number
+from advsearch.controls.base import Control, Parameter, Value, Values, measure, number
 from advsearch.controls.ranges import Fixed, OneOf, Range, Spec
 from advsearch.controls.shadow import polygon
 from advsearch.errors import InputError
@@ -245,9 +245,8 @@ class ContentsControl(Control):
         values = super().values(u)  # of ingredients, where the stick is cut
         return {**values, **self.proportions(values)}
 
-    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        values = self.values(u.detach())
-        return super().describe(u, so_far) | {f"{self.name}.{name}": measure(values[name], "1") for name in INGREDIENTS}
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+        return {name: measure(values[name], "1") for name in INGREDIENTS}
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         vessel = interior(self.scene.object)

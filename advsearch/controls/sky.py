@@ -169,28 +169,24 @@ class SkyControl(Control):
         sky = EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
         return replace(scene, environment=sky).with_values(environment__rotation=0.0, environment__exposure=0.0)
 
+    def fit(self) -> None:
+        super().fit()
+        start = self.values(self.start)
+        numbers = torch.tensor(0.0), start["elevation"], start["turbidity"]  # the sun's azimuth does not matter
+        self._metered = sky_over(self.scene.ground_color, torch.device("cpu"))(*numbers)[1]
+
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {"environment.data": self.radiance(values)}
 
     def radiance(self, values: Values) -> Tensor:
         """Return the map (H, W, 3) of linear radiance at some values; differentiable."""
-        ground = self.scene.ground_color
         numbers = values["azimuth"], values["elevation"], values["turbidity"]
-        radiance, metered = sky_over(ground, numbers[0].device)(*numbers)
-        if self.chosen["exposure"] == "fixed":
-            start = self.values(self.start)
-            metered = metered_at(ground, float(start["elevation"]), float(start["turbidity"])).to(radiance.device)
-        return radiance * (METERED_IRRADIANCE / metered)
+        radiance, metered = sky_over(self.scene.ground_color, numbers[0].device)(*numbers)
+        fixed = self.chosen["exposure"] == "fixed"
+        return radiance * (METERED_IRRADIANCE / (self._metered.to(radiance.device) if fixed else metered))
 
 
 @lru_cache(maxsize=4)
 def sky_over(ground: tuple[float, ...], device: torch.device) -> Sky:
     """Return the sky over a ground of an sRGB colour: far away it is made of the same as the ground plane."""
     return Sky(srgb_to_linear(torch.tensor(ground)).to(device))
-
-
-@lru_cache(maxsize=16)
-def metered_at(ground: tuple[float, ...], elevation: float, turbidity: float) -> Tensor:
-    """Return the metered irradiance () of a sky; the sun's azimuth does not matter."""
-    numbers = (torch.tensor(number) for number in (0.0, elevation, turbidity))
-    return sky_over(ground, torch.device("cpu"))(*numbers)[1]
