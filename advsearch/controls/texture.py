@@ -28,7 +28,7 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.gradients import Budget, Group
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import texel_area, texels_of_faces
+from advsearch.scene.raster import rasterised, texels_of_faces
 
 RESOLUTIONS = (256, 512)  # smallest and largest side that is taken from the object's own texture when none is asked for
 DEFAULT_EPSILON = 0.1
@@ -116,7 +116,7 @@ class TextureControl(Control):
         mask = torch.ones(shape, dtype=torch.bool) if where is None else where
         texels, norm, epsilon = original[mask], self.chosen["norm"], self._given.get("epsilon")
         if self.form == "palette":
-            area = np.where(mask.numpy(), texel_area(part.mesh, shape), 0.0).astype(np.float32)
+            area = np.where(mask.numpy(), rasterised(part.mesh, shape).areas(), 0.0).astype(np.float32)
             weight = area if area.any() else mask.numpy().astype(np.float32)
             centres = palette(original, weight, int(self.chosen["colors"]))
             painter = recoloured(texels, centres, Budget(norm, radius(norm, epsilon, centres.numel())))
