@@ -380,11 +380,7 @@ def _quantile(count: int, looks: int) -> float:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How many samples a pixel trials over many conditions need (docs/design.md).
-#
-# What is verified there is a rate: the share of conditions under which the model is wrong. A condition whose margin is
-# near zero comes out one way or the other by noise, however many samples there are, and as often one way as the other.
-# So only what noise does to the margins on average counts, and the share of conditions which that carries over zero.
+# How many samples a pixel trials over many conditions need: of a rate (docs/design.md).
 
 CONDITIONS = 30  # conditions under which each configuration is rendered at each sample count
 MOVED = 0.05  # share of the conditions that more samples may carry over zero

@@ -281,7 +281,7 @@ class Control:
         mesh = self.mesh
         if mesh in scene.meshes:
             return scene.meshes[mesh]
-        if any(one.name == mesh for one in scene.parts if isinstance(one, PluginPart)):
+        if any(part.name == mesh for part in scene.parts if isinstance(part, PluginPart)):
             raise InputError(
                 f"`controls` {self.name}: {mesh} is around the object in a Mitsuba scene, and stays as it is; "
                 f"make it the object, or vary its numbers by Mitsuba's names, mitsuba:{mesh}.KEY=[low, high]"
@@ -469,9 +469,9 @@ class Control:
                 value = spec.at(u[place], log=parameter.log) if mapped else every[place]
                 values[parameter.name] = value if parameter.shape else value.reshape(())
                 continue
-            one = spec.value if isinstance(spec, Fixed) else spec.at(u[slot.begin])
-            shape = (slot.size,) if parameter.shape and not isinstance(one, str) else ()
-            number = parameter.options.index(one) if isinstance(one, str) else one
+            chosen = spec.value if isinstance(spec, Fixed) else spec.at(u[slot.begin])
+            shape = (slot.size,) if parameter.shape and not isinstance(chosen, str) else ()
+            number = parameter.options.index(chosen) if isinstance(chosen, str) else chosen
             values[parameter.name] = torch.full(shape, float(number), dtype=torch.float32, device=u.device)
         return values
 
@@ -523,8 +523,9 @@ class Control:
     def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
         """Return the numbers of the configuration by parameter, in its unit, (k,) or without dimensions, as
         differentiable functions of u; names have none."""
-        values, parameters = self.values(u), [slot.parameter for slot in self.slots]
-        return {one.name: values[one.name] for one in parameters if not one.options and len(one.shape) < 2}
+        values, declared = self.values(u), [slot.parameter for slot in self.slots]
+        named = [parameter.name for parameter in declared if not parameter.options and len(parameter.shape) < 2]
+        return {name: values[name] for name in named}
 
     def printed(self, u: Tensor) -> Tensor | None:
         """Return the searched colours that a printer would print, (h, w, 3) display-referred sRGB in [0, 1], as a

@@ -75,10 +75,7 @@ class Body:
 # ---- modes over space ------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=8)
-def body(mesh: Mesh) -> Body:
-    """Return the welded mesh; kept in memory."""
-    return Body(mesh)
+body = lru_cache(maxsize=8)(Body)  # of a mesh; kept in memory
 
 
 @lru_cache(maxsize=8)

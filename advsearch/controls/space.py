@@ -194,10 +194,10 @@ class Space:
                 views = [
                     view_of(
                         scene,
-                        found["camera.to_world"].detach().double().numpy(),
-                        float(found["camera.fov"]) if "camera.fov" in found else None,
+                        seen["camera.to_world"].detach().double().numpy(),
+                        float(seen["camera.fov"]) if "camera.fov" in seen else None,
                     )
-                    for found in inputs
+                    for seen in inputs
                 ]
                 break
         return (*scene.notes, *past(scene, views, turns=turns))
