@@ -12,17 +12,19 @@ classifier's see `gradients.SEARCH_STEP`. The renders of a difference share thei
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Mesh
+from advsearch.scene.assets import Mesh, Shape
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import camera_to_world, driving, projected, seated
 from advsearch.scene.gradients import Group
-from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass
+from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart
 
 ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})
 """Inputs that Mitsuba never sees: the renderer applies them to radiance."""
@@ -70,6 +72,20 @@ class MovingMesh:
         rounded = np.round(np.concatenate([self._mesh.vertices * 1e5, self._mesh.normals * 1e3], axis=1))
         groups = np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1)
         return torch.from_numpy(self._mesh.faces.astype(np.int64)), torch.from_numpy(groups.astype(np.int64))
+
+
+def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
+    """Return a mesh of a scene as its inputs, those of `MitsubaScene` that differ from the base values, have it: in
+    world space, z up."""
+    begin = f"{part.name}."
+    own = {key.removeprefix(begin): value.detach().cpu() for key, value in inputs.items() if key.startswith(begin)}
+    places = dict(zip(("vertices", "normals"), MovingMesh(part.mesh, part.to_world).place(None, None), strict=True))
+    rows = {name: own.get(name, flat).reshape(-1, 3).to(torch.float32).numpy() for name, flat in places.items()}
+    mesh, color = replace(part.mesh, vertices=rows["vertices"], normals=rows["normals"]), part.base_color
+    if "base_color" in own:
+        color = linear_to_srgb(own["base_color"].clamp(0.0, 1.0)).numpy()
+    material = replace(part.material, **{key: float(own[key]) for key in vars(part.material) if key in own})
+    return replace(part, mesh=mesh, base_color=color, material=material, to_world=np.eye(4))
 
 
 AWAY = 1000.0  # object sizes to the side, where a thing is under a pixel wide

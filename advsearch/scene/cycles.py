@@ -22,11 +22,12 @@ from torch import Tensor
 
 from advsearch import files
 from advsearch.errors import AdvsearchError, FileFormatError
+from advsearch.scene.assembly import posed
 from advsearch.scene.assets import Material, Mesh, Shape
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.glb import glb, posed
+from advsearch.scene.glb import glb
 from advsearch.scene.grounds import paved
 from advsearch.scene.importing.blender import command, last_line, surroundings
 from advsearch.scene.parts import BallLamp, MeshPart, PointLamp

@@ -33,11 +33,12 @@ from advsearch.report.shown import result_html, shown, side_by_side
 from advsearch.runs import files, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.runs.files import write_bytes
+from advsearch.scene.assembly import posed
 from advsearch.scene.assets import Shape, simpler
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.glb import posed, web_glb
+from advsearch.scene.glb import web_glb
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 from advsearch.tasks import Judgement, Mark

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import distance_transform_edt
 
 from advsearch.scene.assets import Bools, Doubles, Floats, Ints, grouped
 from advsearch.scene.color import srgb_to_linear
@@ -118,6 +117,8 @@ def with_opacity(color: Floats | None, factor: Floats, cutoff: float | None) -> 
     """Return a base colour (..., 3 or 4), None of None, with its alpha times a factor (1,) as opacity, or as (..., 3)
     where it is opaque. What is cut out of a picture gets the nearest colour that is seen. From the cutoff on it is
     opaque, and under it there is nothing; None for shares in between."""
+    from scipy.ndimage import distance_transform_edt  # late: the reader of USD, a process of its own, needs no scipy
+
     if color is None:
         return None
     opacity = (color[..., 3:] if color.shape[-1] == 4 else np.ones_like(color[..., :1])) * factor
