@@ -124,11 +124,8 @@ def _default_range(control: type[Control], parameter: str) -> object:
 
 
 def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
-    """Return the settings of each control, with ranges of Mitsuba's names under one.
-
-    Raises:
-        InputError: one has something else than settings.
-    """
+    """Return the settings of each control, with ranges of Mitsuba's names under one. Raises InputError: one has
+    something else than settings."""
     by_name: dict[str, Mapping[str, object]] = {}
     for name, given in by_key(asked).items():
         if given is not None and not isinstance(given, Mapping):
@@ -159,11 +156,8 @@ def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them into something that can be searched.
-
-    Raises:
-        InputError: no control, two of one name, one that the scene cannot take, or nothing that varies.
-    """
+    """Let controls prepare a scene, bind them to it and compose them into something that can be searched. Raises
+    InputError: no control, two of one name, one that the scene cannot take, or nothing that varies."""
     if not controls:
         raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
     space = compose(controls, scene)
@@ -182,12 +176,9 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
 
 
 def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them; none, or only fixed ones, will do.
-
-    Raises:
-        InputError: two controls of one name, one that the scene cannot take, or one that leaves out what the scene was
-            asked to have.
-    """
+    """Let controls prepare a scene, bind them to it and compose them; none, or only fixed ones, will do. Raises
+    InputError: two controls of one name, one that the scene cannot take, or one that leaves out what the scene was
+    asked to have."""
     names = [control.name for control in controls]
     if len(set(names)) != len(names):
         raise InputError(

@@ -140,11 +140,8 @@ class Choice:
     most: float | None = None
 
     def check(self, control: str, given: object) -> None:
-        """Check what was chosen in an instance of a control; None is fine where it is the default.
-
-        Raises:
-            InputError: it cannot be chosen.
-        """
+        """Check what was chosen in an instance of a control; None is fine where it is the default. Raises InputError:
+        it cannot be chosen."""
         allowed, fits = "", True
         if self.options:
             allowed, fits = f"one of {', '.join(self.options)}", given in self.options
@@ -257,11 +254,8 @@ class Control:
         return cls.parameters
 
     def check_choices(self) -> None:
-        """Check what the choices' own declarations do not say of `self.chosen`; by default nothing.
-
-        Raises:
-            InputError: a choice is out of range.
-        """
+        """Check what the choices' own declarations do not say of `self.chosen`; by default nothing. Raises InputError:
+        a choice is out of range."""
 
     def settings(self) -> dict[str, object]:
         """Return what `make_control` needs to make an equal instance, as JSON values."""
@@ -273,11 +267,7 @@ class Control:
         return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
-        """Return that mesh in a scene.
-
-        Raises:
-            UnknownNameError: there is none of that name.
-        """
+        """Return that mesh in a scene. Raises UnknownNameError: there is none of that name."""
         mesh = self.mesh
         if mesh in scene.meshes:
             return scene.meshes[mesh]
@@ -333,10 +323,7 @@ class Control:
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with whatever this control needs to be in it (a light, a medium); by default unchanged.
-
-        Raises:
-            InputError: the scene cannot take it.
-        """
+        Raises InputError: the scene cannot take it."""
         return scene
 
     def within(self, scene: SceneDescription) -> Self:
@@ -346,21 +333,15 @@ class Control:
         return there
 
     def bind(self, scene: SceneDescription) -> Self:
-        """Return a copy that is fit to a scene that all controls of the space have prepared.
-
-        Raises:
-            InputError: a setting of the control is impossible in this scene.
-        """
+        """Return a copy that is fit to a scene that all controls of the space have prepared. Raises InputError: a
+        setting of the control is impossible in this scene."""
         bound = self.within(scene)
         bound.fit()
         return bound
 
     def fit(self) -> None:
-        """Set `start` and `groups`, and `moved` where there is something to say, for `self.scene`.
-
-        Raises:
-            InputError: a setting of the control is impossible in this scene.
-        """
+        """Set `start` and `groups`, and `moved` where there is something to say, for `self.scene`. Raises InputError: a
+        setting of the control is impossible in this scene."""
         slots, begin = list[Slot](), 0
         for slot in self.laid_out():
             slots.append(replace(slot, begin=begin))
@@ -406,11 +387,7 @@ class Control:
             yield Slot(parameter, self.spec(parameter))
 
     def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:
-        """Yield the values of the clean scene that the start has not.
-
-        Raises:
-            InputError: one of them was asked for.
-        """
+        """Yield the values of the clean scene that the start has not. Raises InputError: one of them was asked for."""
         for slot in slots:
             parameter, wanted, used = slot.parameter, self.unchanged(slot.parameter), slot.start_value()
             if self.amount not in (None, parameter.name) or same(used, wanted, turns=slot.turns):

@@ -79,11 +79,8 @@ class PictureControl(Control):
         return values | {self.shown: shown}
 
     def read_picture(self) -> Tensor | None:
-        """Return the picture (h, w, 3) sRGB that was chosen; None where none was.
-
-        Raises:
-            FileFormatError: it cannot be read.
-        """
+        """Return the picture (h, w, 3) sRGB that was chosen; None where none was. Raises FileFormatError: it cannot be
+        read."""
         if self.chosen["picture"] is None:
             return None
         try:

@@ -328,12 +328,9 @@ class Slot:
 
 
 def read_drawn(where: str, parameter: Parameter, given: Mapping[str, object]) -> DrawnRange:
-    """Return the spec of a parameter from its distribution, `{distribution: NAME, PARAMETER: NUMBER, ...}`.
-
-    Raises:
-        InputError: there is none of that name, it has other parameters, it was a function from Python, or more of it
-            than `MOST_OUTSIDE` lies outside of the parameter's bounds.
-    """
+    """Return the spec of a parameter from its distribution, `{distribution: NAME, PARAMETER: NUMBER, ...}`. Raises
+    InputError: there is none of that name, it has other parameters, it was a function from Python, or more of it than
+    `MOST_OUTSIDE` lies outside of the parameter's bounds."""
     if isinstance(given, OwnQuantiles):
         return _own(where, parameter, given)
     name = given[DISTRIBUTION]
