@@ -245,12 +245,8 @@ class Control:
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance that is given some settings: those of the class, unless the scene or the
-        settings name them.
-
-        Args:
-            settings: names of what is given, perhaps with the values.
-        """
+        """Return the parameters of an instance that is given some settings, by name, perhaps with the values: those of
+        the class, unless the scene or the settings name them."""
         return cls.parameters
 
     def check_choices(self) -> None:

@@ -209,11 +209,8 @@ class Limits:
     with `r_i` what each bound would be used up to, 1 being all of it: the length of d at each place (1), the gradient
     of the displacement along each face (`FACE_STRAIN`), and between the two sides of each wall (`WALL_STRAIN`). As
     `s max r < 1`, no place moves further than epsilon, no face turns over (its tangent map is I + B with ||B|| < 1,
-    and so has a positive determinant), and walls and gaps between places keep more than half their width.
-
-    Args:
-        solid: the welded mesh.
-        epsilon: largest displacement, in the mesh's units.
+    and so has a positive determinant), and walls and gaps between places keep more than half their width. Epsilon is
+    in the mesh's units.
     """
 
     def __init__(self, solid: Body, epsilon: float) -> None:

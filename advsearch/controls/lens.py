@@ -88,10 +88,8 @@ def spread(count: int) -> Tensor:
     """Return `count` places spread evenly over the middle 80 % of the picture, the first in its centre.
 
     The places are a lattice with the two irrational steps of the plastic number, a two-dimensional golden ratio
-    (Roberts 2018, The unreasonable effectiveness of quasirandom sequences, R2).
-
-    Returns:
-        (2, count) float32: x and y in [0.1, 0.9].
+    (Roberts 2018, The unreasonable effectiveness of quasirandom sequences, R2). They are (2, count) float32: x and y in
+    [0.1, 0.9].
     """
     plastic = 1.324717957244746
     steps = torch.tensor([[1.0 / plastic], [1.0 / plastic**2]], dtype=torch.float64)

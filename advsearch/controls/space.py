@@ -76,14 +76,9 @@ class Space:
         return tuple(sorted(range(len(kinds)), key=kinds.__getitem__))
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
-        """Map u to scene inputs, by differentiable torch operations.
-
-        Controls that refine what others set come later, and those that lie on top last, whatever the order in which
-        they were asked for.
-
-        Raises:
-            InputError: two controls set one input.
-        """
+        """Map u to scene inputs, by differentiable torch operations. Controls that refine what others set come later,
+        and those that lie on top last, whatever the order in which they were asked for. Raises InputError: two controls
+        set one input."""
         parts, merged, set_by = u.split(self.sizes), dict[str, Tensor](), dict[str, str]()
         for number in self._turns:
             control = self.controls[number]
@@ -148,14 +143,8 @@ class Space:
         return replace(self, controls=tuple(control.later(seconds) for control in self.controls))
 
     def holding(self, u: Tensor) -> Space:
-        """Return the space whose first controls stay where a configuration of them has them, so that the others vary.
-
-        Args:
-            u: (d,) of as many whole controls.
-
-        Raises:
-            InputError: no number of controls has so many coordinates.
-        """
+        """Return the space whose first controls stay where a configuration u (d,) of as many has them, so that the
+        others vary. Raises InputError: no number of controls has so many coordinates."""
         sizes = self.sizes
         count = next((k for k in range(len(sizes) + 1) if sum(sizes[:k]) == len(u)), None)
         if count is None:
@@ -166,11 +155,8 @@ class Space:
         return replace(self, controls=(*held, *self.controls[count:]), environment=lit_by)
 
     def lit_by(self, values: Mapping[str, Value]) -> str | None:
-        """Return what lights a configuration in the place of the scene's environment; None if nothing does.
-
-        Args:
-            values: the configuration as it is described.
-        """
+        """Return what lights a configuration, by the values that describe it, in the place of the scene's environment;
+        None if nothing does."""
         for group in self.groups:
             if group.setting == ENVIRONMENT:
                 chosen = str(values[group.name]["value"])
