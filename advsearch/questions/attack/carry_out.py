@@ -24,7 +24,8 @@ from advsearch.cluster import Call, Executor, Work
 from advsearch.cluster.dask_pool import executor_of
 from advsearch.config import SceneConfig, has_address, one_only
 from advsearch.controls import make_space
-from advsearch.controls.base import Control, by_distribution, sentences
+from advsearch.controls.base import Control, sentences
+from advsearch.controls.ranges import by_distribution
 from advsearch.engine import judging, loading, naming
 from advsearch.engine.journal import Journal, Shared, check_made_of, worker_call
 from advsearch.engine.judging import AnyObjective, Described, Looked, Metric, Metrics

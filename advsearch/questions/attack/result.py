@@ -17,8 +17,8 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult
-from advsearch.controls.base import OneOf
 from advsearch.controls.path import WAY, PathControl
+from advsearch.controls.ranges import OneOf
 from advsearch.engine.judging import task_for
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import AnyModel, in_turn
