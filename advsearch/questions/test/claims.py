@@ -178,7 +178,7 @@ class Trial:
                 picture = pictures.get(query.number)  # what was asked before is read back, without its picture
                 if picture is None:
                     picture = problem.picture(query.u, query.seed, query.spp)
-                yield other.trial(shown(query, picture), other.whole(query.u))
+                yield Evaluation.of(other.judge(shown(query, picture), other.whole(query.u)))
 
         for batch in self._batches(journal, drawn(problem, kind, claim.pictures, spp_of(config))):
             pictures.clear()
