@@ -107,7 +107,7 @@ def carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None =
                 )
             findings = Attack(journal, job.config, policy, stages, clean=job.clean).carry_out()
         if isinstance(problem.model.module, AskedModel):
-            warnings.append(problem.model.module.line.sentence)
+            warnings.append(problem.model.module.sentence)
         named = job.objective if isinstance(job.objective, str) else job.config.objective
         result = summarise(job.config, named, findings, journal, stages, warnings)
         parts = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large
