@@ -49,7 +49,6 @@ class _Signature(inspect.Signature):
 
 ONLY_BY_NAME = inspect.Parameter.KEYWORD_ONLY
 RUN = {"run": inspect.Parameter("run", ONLY_BY_NAME, default=None, annotation="str | Path | None")}
-
 KEPT = "The run is kept, in `run` or under runs/."
 SAME = {
     "object": "from `load_scene`, or the name of an object, or a file of one.",
@@ -58,17 +57,14 @@ SAME = {
 }
 RAISED = "InputError: anything that the caller can put right; nothing is written then."
 """What the docstrings of many questions say alike: of the run, of arguments, and of errors."""
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 Made = TypeVar("Made", bound=Config)
 
 
 def asks(config: type[Config]) -> Callable[[Function], Function]:
-    """Give a function that takes settings as `**settings` the signature and the docstring that they come to.
-
-    Every setting becomes a keyword with the default that it is declared with, and a line among the arguments. One that
-    the function has of its own stays as it is there.
-    """
+    """Give a function that takes settings as `**settings` the signature and the docstring that they come to. Every
+    setting becomes a keyword with the default that it is declared with, and a line among the arguments. One that the
+    function has of its own stays as it is there."""
 
     def decorate(function: Function) -> Function:
         own = inspect.signature(function)
@@ -137,7 +133,6 @@ WRITTEN = {
     "estimators": "str | Mapping[str, str]",
 }  # fmt: skip
 """What may be written for some settings beside what they become."""
-
 LISTED = (*SEVERAL, "prompt", "vary", "ways", "quantities", "samplers", "case", "group")
 """Settings that may be a list of names."""
 
