@@ -25,8 +25,8 @@ threads.configure()
 
 from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
 from advsearch.questions.attack.carry_out import problem_from_config  # noqa: E402
+from advsearch.questions.precision import precision  # noqa: E402
 from advsearch.questions.precision.benches import GradientBench, PictureBench, TimeBudget, gradient_parts  # noqa: E402
-from advsearch.questions.precision.carry_out import precision_from_config  # noqa: E402
 from advsearch.questions.precision.result import PrecisionConfig, Recommended  # noqa: E402
 from advsearch.questions.precision.rule import ReferenceValue, SampleSetting, point_of  # noqa: E402
 
@@ -116,7 +116,7 @@ def one(scene: str, args: argparse.Namespace) -> bool:
             error=args.error,
             run=f"{folder}/run",
         )
-        report = precision_from_config(config)
+        report = precision.from_config(config)
     kept = True
     for found in report.recommendations:
         if found.estimator is None or found.quantity == "margin":

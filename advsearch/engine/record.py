@@ -26,7 +26,6 @@ from advsearch.runs.store import Row
 from advsearch.runs.summary import NAME, stored_result
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.base import mean
-from advsearch.viewer.pages import keep_result
 
 KEPT = 4  # pictures of each group of trials that are kept
 
@@ -252,30 +251,27 @@ class Results:
         return None if self._run is None else self._run.store.noted(key)
 
 
-def kept_rows(
-    run: RunDirectory | None, results: Results, rows: Iterable[Kept], result: Callable[[Sequence[Kept], str], Ending]
-) -> Ending:
-    """Take rows until they end, the time is up or there is an interrupt, and keep what they come to after each.
+def taken_rows(asked: Any, results: Results, rows: Iterable[Kept], result: Callable[[list[Kept]], Ending]) -> Ending:
+    """Take rows until they end, the time is up or there is an interrupt, and write what they come to after each, into
+    the run of what is `asked` (`question.Asked`).
 
     The summary never has fewer rows than an earlier sitting left in it: those are read back first.
     """
     taken: list[Kept] = []
-    ending = INTERRUPTED
+    asked.ending = INTERRUPTED
     try:
         with interruptible():
             for row in rows:
                 taken.append(row)
-                if results.made and run is not None:
-                    run.write_summary(result(taken, ending))  # what a kill leaves
-            ending = "done"
+                if results.made:
+                    asked.run.write_summary(result(taken))  # what a kill leaves
+            asked.ending = "done"
     except KeyboardInterrupt:
         pass
     except OutOfTime:
-        ending = OUT_OF_TIME
-    made = result(taken, ending)
-    if run is None:
-        return made
-    if ending == INTERRUPTED and not results.made and (run.path / NAME).is_file():
-        before = stored_result(run.path)
+        asked.ending = OUT_OF_TIME
+    made = result(taken)
+    if asked.ending == INTERRUPTED and not results.made and (asked.run.path / NAME).is_file():
+        before = stored_result(asked.run.path)
         return before if isinstance(before, type(made)) else made
-    return keep_result(run, made)
+    return made

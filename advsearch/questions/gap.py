@@ -86,11 +86,10 @@ def gap(asked: Asked[GapConfig]) -> GapResult:
             worst = summary.verified
             own = {"object": one.config.object, "control": one.of, "worst": worst, "margin": worst and worst.margin}
             rows.append(GapRow.of({**vars(summary), **own}))
-    return asked.result(GapResult, table=rows, parts=study.names, warnings=study.warnings)
+    return study.result(GapResult, table=rows)
 
 
 def shown(result: GapResult) -> ShownResult:
-    """Return the average and the worst case of each object and control."""
     columns: dict[str, Column] = {
         "object": "{0.object}",
         "control": "{0.control}",
@@ -137,7 +136,6 @@ def draw(result: GapResult, axes: Any) -> None:
 
 
 def claims(result: GapResult) -> Iterator[Claim]:
-    """Yield both cases of each object and control."""
     for row in result.table:
         name = f"{row.object}, {row.control}"
         yield average_claim(row.average, name)

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Figures = dict[str, bytes]  # A suffix, png or svg, to the content of a file
-
 BLUE, RED, GREY = "#1d5fd0", "#b3261e", "#5c606a"
 STYLE: dict[Any, Any] = {
     "font.family": ["DejaVu Sans"], "font.size": 9.0, "legend.frameon": False, "legend.fontsize": 8.0,
@@ -141,7 +140,6 @@ def axis_title(name: str, unit: str) -> str:
 
 
 def figure_of(draw: Callable[[Any], object], size: tuple[float, float]) -> Figures:
-    """Return what is drawn on the axes of a new figure of a size in inches."""
     return drawn(lambda figure: draw(figure.subplots()), size)
 
 
@@ -153,7 +151,6 @@ TRUE, SAID = (0, 190, 255), (255, 110, 0)
 """Colours of what is true and of what the model says; told apart in any kind of colour vision."""
 SMALLEST = 512  # Pixels of the longest side at least; smaller pictures are magnified, so that text can be read
 TINT, LETTERS = 0.45, 28  # How much of a tint covers a picture; how many letters are as high as its longest side
-
 Box = tuple[float, float, float, float]
 Shape = Any  # What is drawn, a box or the pixels of a mask: `advsearch.tasks.Mark`
 
@@ -176,7 +173,7 @@ def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(max(size) // LETTERS)
     boxes = [(shape, _corners(shape.box, factor, size)) for shape in shapes if shape.box is not None]
     for shape, ends in boxes:
-        draw.rectangle(ends, outline=_colour(shape), width=2)
+        draw.rectangle(ends, outline=TRUE if shape.true else SAID, width=2)
     written: list[tuple[int, int, int, int]] = []
     for shape, ends in boxes:
         written.append(_write(draw, shape, ends, size, font, written))
@@ -187,7 +184,6 @@ def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
 
 
 def _panel(shape: Shape, first: Any, size: tuple[int, int], font: Any) -> Image.Image:
-    """A map in greys, in the range that the first of them has."""
     low, high = float(first.min()), float(first.max())
     greys = np.clip((np.asarray(shape.map, dtype=np.float64) - low) / max(high - low, 1e-12), 0.0, 1.0)
     levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
@@ -208,12 +204,7 @@ def _draw_mask(image: Image.Image, mask: npt.NDArray[np.bool_], true: bool) -> N
     image.paste(colour, (0, 0), Image.fromarray(np.rint(255.0 * strength).astype(np.uint8)))
 
 
-def _colour(shape: Shape) -> tuple[int, int, int]:
-    return TRUE if shape.true else SAID
-
-
 def _corners(box: Box, factor: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """The first and the last pixel of a box in a magnified picture, as far as it is inside."""
     x0, y0, x1, y1 = (round(end * factor) for end in box)
     left, top = (min(max(start, 0), side - 1) for start, side in zip((x0, y0), size, strict=True))
     right, bottom = (min(end, side) - 1 for end, side in zip((x1, y1), size, strict=True))
@@ -221,13 +212,9 @@ def _corners(box: Box, factor: int, size: tuple[int, int]) -> tuple[int, int, in
 
 
 def _write(
-    draw: ImageDraw.ImageDraw,
-    shape: Shape,
-    ends: tuple[int, int, int, int],
-    size: tuple[int, int],
-    font: Any,
+    draw: ImageDraw.ImageDraw, shape: Shape, ends: tuple[int, int, int, int], size: tuple[int, int], font: Any,
     others: Sequence[tuple[int, int, int, int]],
-) -> tuple[int, int, int, int]:
+) -> tuple[int, int, int, int]:  # fmt: skip
     """Write beside a box, and return where: above it, or below where it is true, where no other text is."""
     text = f"true: {shape.text}" if shape.true else shape.text
     left, top, right, bottom = map(round, draw.textbbox((0, 0), text, font=font))
@@ -240,7 +227,7 @@ def _write(
 
     rows = sorted(range(max(size[1] - high, 0) + 1), key=lambda row: (abs(row - y), row))
     y = next(filter(free, rows), y)
-    draw.rectangle((x, y, x + wide, y + high), fill=_colour(shape))
+    draw.rectangle((x, y, x + wide, y + high), fill=TRUE if shape.true else SAID)
     draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)
     return x, y, x + wide, y + high
 
@@ -265,7 +252,10 @@ def contact_sheet(pictures: Sequence[Floats], captions: Sequence[Sequence[str]])
         tile = Image.fromarray(to_8bit(picture)).resize((width, height), Image.Resampling.NEAREST)
         sheet.paste(tile, (left, top))
         for place, line in enumerate(lines):
-            text = _cut(line, width, draw, font)
+            text = short = " ".join(line[:200].split())
+            while short and draw.textlength(text, font=font) > width:
+                short = short[:-1]
+                text = f"{short}..."
             draw.text((left, top + height + LINE * place), text, fill="black", font=font)
     levels: Floats = np.asarray(sheet, dtype=np.float32)
     return np.asarray(levels / np.float32(255.0))
@@ -275,12 +265,3 @@ def columns_for(count: int) -> int:
     """Return how many of `count` tiles stand side by side: about the square root, and no holes where that can be."""
     least = math.ceil(math.sqrt(count))
     return next((columns for columns in range(least, 2 * least + 1) if count % columns == 0), least)
-
-
-def _cut(line: str, width: int, draw: ImageDraw.ImageDraw, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> str:
-    text = " ".join(line[:200].split())
-    if draw.textlength(text, font=font) <= width:
-        return text
-    while text and draw.textlength(text + "...", font=font) > width:
-        text = text[:-1]
-    return text + "..."

@@ -10,7 +10,7 @@ import io
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,6 @@ from advsearch.files import read_bytes
 
 Bytes = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
-
 INCH = 25.4
 PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}  # Width and height in millimetres
 MARGIN, FOOT = 15.0, 20.0  # White around what is printed, and more below for the ruler, millimetres
@@ -61,9 +60,13 @@ class Piece:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Width and height within the bleed, millimetres."""
         height, width = self.picture.shape[:2]
         return (width - 2 * self.bleed[0]) * self.pixel[0], (height - 2 * self.bleed[1]) * self.pixel[1]
+
+    @property
+    def frame(self) -> tuple[float, float]:
+        """Bleed and marks on each side, millimetres: across and down."""
+        return self.bleed[0] * self.pixel[0] + AWAY + MARK, self.bleed[1] * self.pixel[1] + AWAY + MARK
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,17 +83,17 @@ class Placed:
     x: float = 0.0
     y: float = 0.0
 
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height that it takes with bleed and marks, millimetres."""
+        (x0, x1, y0, y1), frame, pixel = self.trim, self.piece.frame, self.piece.pixel
+        return (x1 - x0) * pixel[0] + 2 * frame[0], (y1 - y0) * pixel[1] + 2 * frame[1]
+
 
 def write_sheets(
-    path: Path,
-    pieces: Sequence[Piece],
-    title: str,
-    *,
-    paper: str = "a4",
-    profile: Path | None = None,
-    most: int = MOST_SHEETS,
-    last: Callable[[str, tuple[float, float], Any], Figure] | None = None,
-) -> int:
+    path: Path, pieces: Sequence[Piece], title: str, *, paper: str = "a4", profile: Path | None = None,
+    most: int = MOST_SHEETS, last: Callable[[str, tuple[float, float], Any], Figure] | None = None,
+) -> int:  # fmt: skip
     """Write the PDF of at least one piece, and return how many pages it has.
 
     Colours are converted into an ICC `profile` of an RGB printer; None leaves them sRGB. At most so many sheets, 1 to
@@ -102,7 +105,14 @@ def write_sheets(
         raise InputError(f"paper: expected one of {', '.join(PAPERS)}, got {paper!r}")
     if not 1 <= most <= SHEETS_EVER:
         raise InputError(f"sheets: expected a whole number from 1 to {SHEETS_EVER}, got {most}")
-    convert = None if profile is None else _conversion(profile)
+    convert: Any = None
+    if profile is not None:
+        data = read_bytes(profile, "an ICC profile", LARGEST_PROFILE)
+        try:
+            printer = ImageCms.ImageCmsProfile(io.BytesIO(data))
+            convert = ImageCms.buildTransform(ImageCms.createProfile("sRGB"), printer, "RGB", "RGB")
+        except (ImageCms.PyCMSError, OSError, ValueError) as error:
+            raise FileFormatError(f"{profile}: expected the ICC profile of an RGB printer ({error})") from None
     pages = list(pages_of(pieces, PAPERS[paper]))
     if len(pages) > most:
         raise InputError(
@@ -129,64 +139,47 @@ def pages_of(pieces: Sequence[Piece], paper: tuple[float, float]) -> Iterator[li
     pixel is larger than a page, or there would be more than `SHEETS_EVER` pages."""
     width, height = paper[0] - 2 * MARGIN, paper[1] - 2 * MARGIN - FOOT
     parts = [part for piece in pieces for part in _parts(piece, width, height)]
-    parts.sort(key=lambda part: -_extent(part)[1])
+    parts.sort(key=lambda part: -part.extent[1])
     page: list[Placed] = []
     x = y = row = 0.0
     for part in parts:
-        across, down = _extent(part)
+        across, down = part.extent
         if x + across > width and x > 0.0:
             x, y, row = 0.0, y + row, 0.0
         if y + down > height and page:
             yield page
             page, x, y, row = [], 0.0, 0.0, 0.0
-        frame = _frame(part.piece)
-        page.append(Placed(part.piece, part.name, part.trim, MARGIN + x + frame[0], MARGIN + y + frame[1]))
+        frame = part.piece.frame
+        page.append(replace(part, x=MARGIN + x + frame[0], y=MARGIN + y + frame[1]))
         x, row = x + across, max(row, down)
     if page:
         yield page
 
 
 def _parts(piece: Piece, width: float, height: float) -> Iterator[Placed]:
-    """Cut a piece into parts that fit on a page with bleed and marks, in whole pixels."""
-    frame, (left, top) = _frame(piece), piece.bleed
-    high, wide = piece.picture.shape[0] - 2 * top, piece.picture.shape[1] - 2 * left
-    columns = _cuts(wide, (width - 2 * frame[0]) / piece.pixel[0])
-    rows = _cuts(high, (height - 2 * frame[1]) / piece.pixel[1])
-    several = len(columns) * len(rows) > 1
+    """Cut a piece into equal parts that fit on a page with bleed and marks, in whole pixels."""
+    (left, top), cuts = piece.bleed, []
+    lengths = piece.picture.shape[1] - 2 * left, piece.picture.shape[0] - 2 * top
+    for length, side, frame, pixel in zip(lengths, (width, height), piece.frame, piece.pixel, strict=True):
+        most = (side - 2 * frame) / pixel
+        if most < 1.0:
+            raise InputError("size: a pixel of it is larger than a sheet; give a smaller one, or a larger `paper`")
+        count = math.ceil(length / math.floor(most))
+        cuts.append(list(itertools.pairwise(round(length * number / count) for number in range(count + 1))))
+    columns, rows = cuts
     if len(columns) * len(rows) > SHEETS_EVER:
         raise InputError(f"size: it would take more than {SHEETS_EVER} sheets; give a smaller one")
     for i, (y0, y1) in enumerate(rows):
         for j, (x0, x1) in enumerate(columns):
             name = f"{piece.name}, row {i + 1} of {len(rows)}, column {j + 1} of {len(columns)}"
-            yield Placed(piece, name if several else piece.name, (left + x0, left + x1, top + y0, top + y1))
-
-
-def _cuts(length: int, most: float) -> list[tuple[int, int]]:
-    """Cut so many pixels into equal parts of at most so many; the first and the end of each."""
-    if most < 1.0:
-        raise InputError("size: a pixel of it is larger than a sheet; give a smaller one, or a larger `paper`")
-    count = math.ceil(length / math.floor(most))
-    ends = [round(length * number / count) for number in range(count + 1)]
-    return list(itertools.pairwise(ends))
-
-
-def _frame(piece: Piece) -> tuple[float, float]:
-    """Bleed and marks on each side, millimetres: across and down."""
-    return piece.bleed[0] * piece.pixel[0] + AWAY + MARK, piece.bleed[1] * piece.pixel[1] + AWAY + MARK
-
-
-def _extent(part: Placed) -> tuple[float, float]:
-    """Width and height that a part takes with bleed and marks, millimetres."""
-    x0, x1, y0, y1 = part.trim
-    frame, pixel = _frame(part.piece), part.piece.pixel
-    return (x1 - x0) * pixel[0] + 2 * frame[0], (y1 - y0) * pixel[1] + 2 * frame[1]
+            name = name if len(columns) * len(rows) > 1 else piece.name
+            yield Placed(piece, name, (left + x0, left + x1, top + y0, top + y1))
 
 
 # ---- drawing --------------------------------------------------------------------------------------------------------
 
 
 def blank(paper: tuple[float, float]) -> tuple[Figure, Axes]:
-    """A page and its axes in millimetres from the upper left corner."""
     figure = Figure(figsize=(paper[0] / INCH, paper[1] / INCH))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
@@ -217,9 +210,9 @@ def _cover(
         *[f"{piece.name}: {piece.size[0]:.1f} x {piece.size[1]:.1f} mm" for piece in pieces[:30]],
         *([f"and {len(pieces) - 30} more"] if len(pieces) > 30 else []),
     ]
-    top = y + 15.0
-    _line(axes, [x, x + SQUARE, x + SQUARE, x, x], [top, top, top + SQUARE, top + SQUARE, top])
-    axes.text(x, top + SQUARE + 10.0, "\n".join(lines), fontsize=9, va="top", linespacing=1.6)
+    top, right, bottom = y + 15.0, x + SQUARE, y + 15.0 + SQUARE
+    _line(axes, [x, right, right, x, x], [top, top, bottom, bottom, top])
+    axes.text(x, bottom + 10.0, "\n".join(lines), fontsize=9, va="top", linespacing=1.6)
     _ruler(axes, paper)
     return figure
 
@@ -241,24 +234,13 @@ def _draw(axes: Axes, part: Placed, convert: Any) -> None:
     right, bottom = part.x + (x1 - x0) * wide, part.y + (y1 - y0) * high
     outer = (part.x - left * wide, right + left * wide, part.y - top * high, bottom + top * high)
     axes.imshow(picture, extent=(outer[0], outer[1], outer[3], outer[2]), interpolation="none", aspect="auto")
-    for x, away in ((part.x, -1.0), (right, 1.0)):
-        for y, up in ((part.y, -1.0), (bottom, 1.0)):
-            edge_x = outer[0] - AWAY if away < 0 else outer[1] + AWAY
-            edge_y = outer[2] - AWAY if up < 0 else outer[3] + AWAY
-            _line(axes, [edge_x, edge_x + away * MARK], [y, y])
-            _line(axes, [x, x], [edge_y, edge_y + up * MARK])
+    for x, edge_x, away in ((part.x, outer[0], -1.0), (right, outer[1], 1.0)):
+        for y, edge_y, up in ((part.y, outer[2], -1.0), (bottom, outer[3], 1.0)):
+            _line(axes, [edge_x + away * AWAY, edge_x + away * (AWAY + MARK)], [y, y])
+            _line(axes, [x, x], [edge_y + up * AWAY, edge_y + up * (AWAY + MARK)])
     if piece.inside is not None:
         inside = np.pad(piece.inside[y0:y1, x0:x1].astype(float), 1)
         xs = part.x + (np.arange(-1, x1 - x0 + 1) + 0.5) * wide
         ys = part.y + (np.arange(-1, y1 - y0 + 1) + 0.5) * high
         axes.contour(xs, ys, inside, levels=[0.5], colors="black", linewidths=0.3)
     axes.text(part.x, outer[2] - AWAY, part.name, fontsize=6, va="bottom")
-
-
-def _conversion(profile: Path) -> Any:
-    data = read_bytes(profile, "an ICC profile", LARGEST_PROFILE)
-    try:
-        printer = ImageCms.ImageCmsProfile(io.BytesIO(data))
-        return ImageCms.buildTransform(ImageCms.createProfile("sRGB"), printer, "RGB", "RGB")
-    except (ImageCms.PyCMSError, OSError, ValueError) as error:
-        raise FileFormatError(f"{profile}: expected the ICC profile of an RGB printer ({error})") from None

@@ -124,14 +124,12 @@ class ShownResult:
 
 
 def shown(result: Result) -> ShownResult:
-    """Return what a person is shown of the result of any question."""
     room = registry.room(result.command)
     made: ShownResult = room.shown(result) if room and room.shown else fields_shown(result)
     return made
 
 
 def remarks_of(result: Result, given: ShownResult) -> list[str]:
-    """Return what has to be known beside a result."""
     ending = getattr(result, "ending", "")
     unsaid = ending == INTERRUPTED and "nterrupted" not in given.said
     stopped = ["Not finished: these are the results so far."] if unsaid else []
@@ -140,13 +138,11 @@ def remarks_of(result: Result, given: ShownResult) -> list[str]:
 
 
 def subject_of(result: Result, given: ShownResult) -> list[str]:
-    """Return what a result is about: objects, controls, model."""
     named = [getattr(result, name, None) or () for name in ("object", "objects", "controls", "model")]
     return [*given.about] or [", ".join([names] if isinstance(names, str) else names) for names in named if names]
 
 
 def facts_of(result: Result, given: ShownResult) -> dict[str, str]:
-    """Return by what a result came about, without what is not known."""
     renders, seconds = getattr(result, "renders", None), getattr(result, "seconds", None)
     spent = sum(renders.values()) if isinstance(renders, Mapping) else renders
     own = {
@@ -166,7 +162,8 @@ def facts_of(result: Result, given: ShownResult) -> dict[str, str]:
 def fields_shown(result: Result) -> ShownResult:
     """Return the lists of a result as tables, its other fields as facts, and what their names mean."""
     values = {name: getattr(result, name) for name in type(result).described()}
-    tables = {name: rows for name, value in values.items() if (rows := _rows(value))}
+    lists = {name: value for name, value in values.items() if isinstance(value, (list, tuple)) and value}
+    tables = {name: rows for name, rows in lists.items() if all(isinstance(row, Fields) for row in rows)}
     elsewhere = (*_ELSEWHERE, *tables, *(name.replace(" ", "_") for name in result.facts()))
     plain = {_words(name): _text(value) for name, value in values.items() if name not in elsewhere}
     described: list[tuple[Fields, set[str]]] = [(result, {name for name, text in plain.items() if text})]
@@ -186,11 +183,6 @@ def fields_shown(result: Result) -> ShownResult:
     sections.append(ResultPart("What these words mean", rows=meaning, folded=True, only="page"))
     brief = result.brief or str(values.get("ending", "done"))
     return ShownResult(brief[:1].upper() + brief[1:] + ".", sections, plain)
-
-
-def _rows(value: object) -> Sequence[Fields]:
-    rows = value if isinstance(value, (list, tuple)) else ()
-    return rows if all(isinstance(row, Fields) for row in rows) else ()
 
 
 def _text(value: object) -> str:
@@ -356,8 +348,9 @@ class InNotebook:
             axes: to draw on; None makes new ones.
         """
         axes = new_axes() if axes is None else axes
-        if part := drawn_part(_shown(self)):
-            part.draw(axes)  # type: ignore[misc]
+        drawn = [part.draw for part in shown(self).sections if part.draw is not None]  # type: ignore[arg-type]
+        for draw in drawn[:1]:
+            draw(axes)
         return axes
 
     def to_pandas(self) -> Any:
@@ -374,57 +367,45 @@ class InNotebook:
         return json_normalize([row.to_dict() for row in rows])
 
     def _repr_html_(self) -> str:
-        return result_html(_shown(self))
+        return result_html(shown(self))  # type: ignore[arg-type]
 
     def _repr_png_(self) -> bytes | None:
-        return result_figure(_shown(self)).get("png")
-
-
-def _shown(result: object) -> ShownResult:
-    assert isinstance(result, Result)
-    return shown(result)
+        return result_figure(shown(self)).get("png")  # type: ignore[arg-type]
 
 
 def result_html(given: ShownResult, pictures: Mapping[str, ArrayLike] | None = None) -> str:
-    """Return a result as a cell of a notebook, with pictures (H, W, 3), sRGB in [0, 1]."""
     figures = []
     for name, image in (pictures or {}).items():
         inside = _picture(png_bytes(image), SHOWN, name), element("figcaption", name)
         figures.append(element("figure", *inside, style="display:inline-block"))
     figure = result_figure(given)
     chart = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
-    parts = [_part(part) for part in given.sections if part.only in ("", "notebook") and not part.empty]
+    parts = []
+    for part in given.sections:
+        if part.only in ("", "notebook") and not part.empty:
+            heads = (
+                element("thead", element("tr", *(element("th", cell) for cell in part.heads))) if part.heads else None
+            )
+            rows = (element("tr", *(element("td", cell) for cell in row)) for row in part.rows)
+            inside = [element("p", text) for text in part.text if text and part.draw is None]
+            inside += [element("table", heads, element("tbody", *rows))] if part.rows else []
+            title = element("p", element("b", part.title)) if part.title else None
+            folded = element("details", element("summary", part.title), *inside)
+            parts.append(folded if part.folded else element("div", title, *inside))
     return element("div", element("p", given.said), *figures, chart, *parts)
 
 
-def drawn_part(given: ShownResult) -> ResultPart | None:
-    """Return the first part of a result that is drawn."""
-    return next((part for part in given.sections if part.draw is not None), None)
-
-
 def result_figure(given: ShownResult) -> Figures:
-    """Return the figure of a result as files; none where nothing of it is drawn."""
-    part = drawn_part(given)
-    if part is None or part.draw is None:
-        return {}
-    return figure_of(part.draw, part.size or (WIDTH, part.height / PIXELS))
+    for part in given.sections:
+        if part.draw is not None:
+            return figure_of(part.draw, part.size or (WIDTH, part.height / PIXELS))
+    return {}
 
 
 def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
-    """Return pictures (H, W, 3) sRGB in [0, 1] beside each other as a PNG."""
     arrays = [np.asarray(picture, dtype=np.float32) for picture in pictures]
     gap = np.ones((len(arrays[0]), GAP, 3), np.float32)
     return png_bytes(np.concatenate([part for array in arrays for part in (array, gap)][:-1], axis=1))
-
-
-def _part(part: ResultPart) -> Html:
-    head = element("thead", element("tr", *(element("th", cell) for cell in part.heads))) if part.heads else None
-    body = (element("tr", *(element("td", cell) for cell in row)) for row in part.rows)
-    texts = [element("p", text) for text in part.text if text and part.draw is None]
-    table = element("table", head, element("tbody", *body)) if part.rows else None
-    if part.folded:
-        return element("details", element("summary", part.title), *texts, table)
-    return element("div", element("p", element("b", part.title)) if part.title else None, *texts, table)
 
 
 def _picture(png: bytes, width: int, alt: str) -> Html:
@@ -465,14 +446,9 @@ def study_chart(draw: Callable[[Axes], object], words: str, width: int = WIDE, h
 
     (file,) = drawn(on_figure, (width / 72, height / 72), ("svg",), STYLE).values()
     return element(
-        "svg",
-        element("title", words),
-        _inline(file.decode("utf-8"), f"{width}-"),
-        viewBox=f"0 0 {width} {height}",
-        class_="chart wide" if width == WIDE else "chart narrow",
-        role="img",
-        aria_label=words,
-    )
+        "svg", element("title", words), _inline(file.decode("utf-8"), f"{width}-"), viewBox=f"0 0 {width} {height}",
+        class_="chart wide" if width == WIDE else "chart narrow", role="img", aria_label=words,
+    )  # fmt: skip
 
 
 def _inline(file: str, prefix: str) -> Html:

@@ -56,9 +56,7 @@ _UNITS = {
 MOST_DECIMALS = 4  # Of a percentage
 PROBABILITY_DECIMALS = 1  # Of a probability that a model gives
 WHOLE = ("background", "itself", "something else")  # Labels without an article
-
 _NONE, _ELSEWHERE = "no ", " elsewhere"
-
 _DOING = {"calls": "calling", "finds": "finding", "sees": "seeing", "takes": "taking", "judges": "judging"}
 _DOING |= {"predicts": "predicting", "commands": "commanding"}
 
@@ -120,7 +118,6 @@ def beside_text(run: str, pair: Any) -> str:
 
 
 def margin_text(task: str) -> str:
-    """Return what the margin of a task is, as a clause."""
     return _MARGINS.get(task, "below 0 where the prediction is wrong")
 
 
@@ -141,7 +138,6 @@ def objective_name(objective: str) -> str:
 
 
 def marks_text(task: str) -> str:
-    """Return what is drawn into the pictures of a task's predictions, in a sentence."""
     return _MARKS.get(task, "Blue is true of the scene, orange is the model's prediction.")
 
 
@@ -343,5 +339,4 @@ def number_text(value: Any) -> str:
 
 
 def conditions_text(conditions: Sequence[ConditionRow]) -> str:
-    """Return conditions in one phrase."""
     return " and ".join(one.text for one in conditions) or "everything that was looked at"

@@ -21,7 +21,7 @@ from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.question import Asked, carried_out, carry_out
-from advsearch.questions.attack import studies as attacking
+from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
 from advsearch.questions.attack.summary import AttackSummary

@@ -30,7 +30,7 @@ from advsearch.engine.planning import TELLS, contested, cosines, measured_plan, 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.check.carry_out import check_from_config
+from advsearch.questions.check import check
 from advsearch.questions.check.result import CheckConfig, shown
 from advsearch.runs.results import Measured
 from advsearch.scene.formation import ImageFormation
@@ -638,8 +638,8 @@ def test_the_smooth_loss_does_not_see_the_edge_of_the_picture() -> None:
 
 def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> None:
     config = CheckConfig(controls={"background": {}}, resolution=(24, 24), spp=4, run=str(tmp_path / "run"))
-    check = check_from_config(config)
-    rows = check.rows
+    checked = check.from_config(config)
+    rows = checked.rows
     linear = [row for row in rows if row.loss == "linear"]
     assert {row.parameter for row in linear} >= {"hue", "saturation", "value"}
     for row in linear:
@@ -655,5 +655,5 @@ def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> N
     for row in single.values():
         assert None not in (row.noise, row.reference_error, row.bias) and math.isfinite(row.value or 0.0)
         assert row.status in ("ok", "noisy", "biased", "reference unusable")
-    text = " ".join(one.title for one in shown(check).sections if not one.empty)
+    text = " ".join(one.title for one in shown(checked).sections if not one.empty)
     assert "Smooth linear loss" in text and "each parameter" in text and "cosine with the converged" in text

@@ -19,7 +19,8 @@ from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.planning import BOUND, measured_bounces
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.check.carry_out import ALL, WHAT, check_from_config, measured_gains, resolved_texels
+from advsearch.questions.check import check
+from advsearch.questions.check.carry_out import ALL, WHAT, measured_gains, resolved_texels
 from advsearch.questions.check.result import CheckConfig
 from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer
@@ -170,7 +171,7 @@ def test_a_check_shows_what_is_left_out(specialise: bool, tmp_path: Path) -> Non
         specialise=specialise,
         run=str(tmp_path / "run"),
     )
-    found = check_from_config(config)
+    found = check.from_config(config)
     said = text_of(found)
     if specialise:
         assert {row.item for row in found.gains} >= {*ITEMS, ALL}

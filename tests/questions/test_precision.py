@@ -21,6 +21,7 @@ from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.precision import carry_out as measuring
+from advsearch.questions.precision import precision
 from advsearch.questions.precision.benches import (
     COUNTS,
     LEAST,
@@ -31,7 +32,7 @@ from advsearch.questions.precision.benches import (
     gradient_parts,
     in_rounds,
 )
-from advsearch.questions.precision.carry_out import Measurement, precision_from_config, recommended, timing_machine
+from advsearch.questions.precision.carry_out import Measurement, recommended, timing_machine
 from advsearch.questions.precision.result import (
     SAMPLERS,
     WARM_UP,
@@ -593,7 +594,7 @@ def test_a_part_that_is_measured_is_kept_and_not_measured_again(
         threads=1,
         run=str(folder),
     )
-    stopped = precision_from_config(config, progress=Stop("gradient of environment: references"))
+    stopped = precision.from_config(config, progress=Stop("gradient of environment: references"))
     assert stopped.ending == "interrupted" and {one.quantity for one in stopped.points} == {"picture", "margin"}
     kept = read_result(folder)
     assert kept.to_dict() == stopped.to_dict() and not finished(folder)

@@ -44,17 +44,10 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
         there = Shared(in_light(problem, lux / own), shared.executor, f"{IN_LIGHT}{lux / own!r}")
         journal = replace(verifier.journal, traced=there)
         tried[lux] = verify(
-            replace(verifier, journal=journal).evaluate_all,
-            problem.domain,
-            u,
-            claim=Ending.FOUND,
-            spp=findings.spp,
-            seed=seeds.stream(problem.seed, "ambient"),
-            trials=verifier.looks,
-            rule=problem.rule,
-            kind=f"ambient {lux:.6g} lux",
-            control=f"control {lux:.6g} lux",
-        )
+            replace(verifier, journal=journal).evaluate_all, problem.domain, u, claim=Ending.FOUND, spp=findings.spp,
+            seed=seeds.stream(problem.seed, "ambient"), trials=verifier.looks, rule=problem.rule,
+            kind=f"ambient {lux:.6g} lux", control=f"control {lux:.6g} lux",
+        )  # fmt: skip
         return tried[lux].ending is Ending.FOUND
 
     good, bad = own, 2.0 * own
@@ -72,7 +65,6 @@ def problems_by_name(problem: Problem) -> Callable[[str], Problem]:
 
 
 def in_light(problem: Problem, times: float) -> Problem:
-    """Return the same problem in so many times the ambient light."""
     controls = [
         bound.in_light(times) if isinstance(bound, ProjectorControl) else bound for bound in problem.space.controls
     ]

@@ -25,50 +25,11 @@ from advsearch.cluster.dask_pool import executor_of
 from advsearch.config import SceneConfig, has_address, one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control, by_distribution, sentences
+from advsearch.engine import judging, loading, naming
 from advsearch.engine.journal import Journal, Shared, check_made_of, worker_call
-from advsearch.engine.judging import (
-    AnyObjective,
-    Described,
-    Looked,
-    Metric,
-    Metrics,
-    check_shared,
-    check_truth,
-    facts_of,
-    load_metrics,
-    metrics_as_settings,
-    objective_for,
-    print_terms,
-    shown,
-    task_for,
-)
-from advsearch.engine.judging import only_here as metrics_only_here
-from advsearch.engine.loading import (
-    SCENE,
-    Controls,
-    Scene,
-    framed,
-    lent,
-    load_scene,
-    make_renderer,
-    only_here,
-    scene_as_settings,
-    settings_of,
-)
-from advsearch.engine.naming import (
-    OF_SCENE,
-    AnyModel,
-    check_not_of_scene,
-    check_not_spread,
-    check_run_settings,
-    exists_here,
-    given_to,
-    load_models,
-    model_name,
-    scene_of,
-    several,
-    told_of_scene,
-)
+from advsearch.engine.judging import AnyObjective, Described, Looked, Metric, Metrics
+from advsearch.engine.loading import SCENE, Controls, Scene, framed
+from advsearch.engine.naming import AnyModel, load_models, model_name, several
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
 from advsearch.engine.transport import CleanMatrix, reason_against
@@ -78,17 +39,11 @@ from advsearch.models import Model
 from advsearch.models.address import AskedModel
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.questions.attack import settings as numbers
 from advsearch.questions.attack.ambient import problems_by_name
 from advsearch.questions.attack.outcome import summarise
 from advsearch.questions.attack.result import AttackResult
-from advsearch.questions.attack.settings import (
-    OVER_NUMBERS,
-    OVER_ONE,
-    OVER_PREDICTED,
-    OVER_RENDERED,
-    STEPS,
-    AttackConfig,
-)
+from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import Attack
 from advsearch.report.wording import count
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
@@ -107,12 +62,9 @@ SEARCHED_WITH = ("the objective", "the policy", "the metric")
 
 
 def attack_once(
-    config: AttackConfig,
-    *,
-    progress: Progress | None = None,
-    resumed: Path | None = None,
+    config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None,
     clean: CleanMatrix | None = None,
-) -> AttackResult:
+) -> AttackResult:  # fmt: skip
     """Attack one object with one epsilon, in a run directory; otherwise as `attack`.
 
     `clean` is shared with attacks whose configurations differ in epsilon alone.
@@ -121,17 +73,16 @@ def attack_once(
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
     progress.stage(LOADING)
-    job = replace(parts_of(config), clean=clean or CleanMatrix())
+    job = parts_of(config)
+    job.clean = clean or job.clean
     return carry_out(job, progress, resumed)
 
 
 def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
-    """Attack a model on a scene that are there, in place of those that the configuration names; nothing is kept."""
     return carry_out(parts_of(config, scene, model), NullProgress())
 
 
 def carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None = None) -> AttackResult:
-    """Do it all, or what is left of a run, in a run directory if it is kept."""
     with ExitStack() as stack:
         kept = None if resumed is None else stack.enter_context(RunDirectory.of(job.config, resumed))
         stages = Stages(progress)
@@ -219,13 +170,11 @@ def parts_of(config: AttackConfig, scene: Scene | None = None, model: Model | No
         raise one_only("object", config.objects)
     searched, drawn = controls_given(config, config.controls, config.over)
     task, objective = task_and_objective(config, config.task, config.objective)
-    policy = make_policy(config.policy_name, **config.policy_options)
-    if scene is not None and model is not None:
-        return AttackParts(config, scene, (model, []), task, searched, drawn, objective, policy, False)
-    scene = lent(SCENE, config.object) or scene_of(config)
-    loaded = models_as_one(config.model, config, task)
-    metrics = load_metrics(config.metrics)
-    return AttackParts(config, scene, loaded, task, searched, drawn, objective, policy, True, metrics)
+    policy, keep = make_policy(config.policy_name, **config.policy_options), scene is None or model is None
+    scene = scene or loading.lent(SCENE, config.object) or naming.scene_of(config)
+    loaded = models_as_one(config.model, config, task) if model is None else (model, [])
+    metrics = judging.load_metrics(config.metrics) if keep else {}
+    return AttackParts(config, scene, loaded, task, searched, drawn, objective, policy, keep, metrics)
 
 
 def parts_in(run: Path) -> AttackParts:
@@ -240,22 +189,21 @@ def controls_given(
 ) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
     """The controls that are searched and those that vary by chance, with the run's settings; only a search has a
     budget."""
-    check_run_settings(config)
-    searched_controls = given_to(config, searched)
-    for control in searched_controls:
+    naming.check_run_settings(config)
+    controls = naming.given_to(config, searched)
+    for control in controls:
         for name, spec in getattr(control, "specs", {}).items():
             if by_distribution(spec):
                 raise InputError(
                     f"`controls` {control.name}.{name}: expected values to search, which are all as good, got how "
                     "likely each is; give a range, or put it into `over`, under which it varies by chance"
                 )
-    return searched_controls, given_to(config.model_copy(update={"epsilon": None}), drawn)
+    return controls, naming.given_to(config.model_copy(update={"epsilon": None}), drawn)
 
 
 def task_and_objective(
     config: AttackConfig, task: AnyTask, objective: AnyObjective | None
 ) -> tuple[Task, AnyObjective]:
-    """The task, and the objective that was asked for or else the task's own, checked before anything is loaded."""
     made = make_task(task)
     wanted = made.objective if objective is None else objective
     check_objective(wanted, made.name, targeted=config.target is not None, minimise=config.minimise)
@@ -263,7 +211,6 @@ def task_and_objective(
 
 
 def models_as_one(model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
-    """Load the model, or the models of an ensemble as one; their warnings become sentences of the run."""
     models, warnings = load_models(several(model), task, config)
     return models[0] if len(models) == 1 else together(models, config.resolution), warnings
 
@@ -285,10 +232,8 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
 def problem_of_parts(parts: AttackParts, **changes: object) -> tuple[Problem, list[str]]:
     """Return the problem that an attack was asked with, other settings in `changes` (of another `model`, its name), and
     warnings on the way."""
-    config = parts.config.model_copy(update=changes)
-    loaded = parts.loaded[0], [*parts.loaded[1]]
-    if "model" in changes:
-        loaded = models_as_one(config.model, config, parts.task)
+    config, (model, warnings) = parts.config.model_copy(update=changes), parts.loaded
+    loaded = models_as_one(config.model, config, parts.task) if "model" in changes else (model, [*warnings])
     problem = problem_on(replace(parts, config=config, loaded=loaded))
     return problem, [*loaded[1], *sentences(problem.space.moved)]
 
@@ -299,42 +244,27 @@ def problem_of(config: AttackConfig, scene: Scene, model: Model, *, differentiat
 
 
 def problem_on(job: AttackParts, *, differentiated: bool = True) -> Problem:
-    """Return the problem that parts make; `differentiated` as for `problem_of`."""
     config, (model, warnings) = job.config, job.loaded
     task, facts = _task(job)
     resolution = config.resolution or model.input_size
     description = framed(job.scene.description, resolution)
     space = make_space((*job.controls, *job.over), description)
-    renderer = make_renderer(
-        description,
-        space,
-        resolution,
-        config.denoise,
-        config.seed,
-        config.estimators,
-        leave_out=EVERYTHING if config.specialise else NOTHING,
-        sampler=config.pixel_sampler,
+    renderer = loading.make_renderer(
+        description, space, resolution, config.denoise, config.seed, config.estimators,
+        leave_out=EVERYTHING if config.specialise else NOTHING, sampler=config.pixel_sampler,
         differentiated=differentiated,
-    )
+    )  # fmt: skip
     features_seed = seeds.stream(config.seed, "clean features")
-    objective, note = objective_for(job.objective, task, model, renderer, features_seed, config.ensemble)
+    objective, note = judging.objective_for(job.objective, task, model, renderer, features_seed, config.ensemble)
     warnings += [note] if note else []
     if config.printable:
         searched = make_space(job.controls, description)
-        print_terms(searched, searched.start)  # refuses where nothing can be printed
+        judging.print_terms(searched, searched.start)  # refuses where nothing can be printed
+    spp = next_count(config.pixel_sampler, config.search_spp)
     problem = Problem(
-        renderer,
-        space,
-        model,
-        task,
-        facts,
-        objective,
-        next_count(config.pixel_sampler, config.search_spp),
-        config.seed,
-        searched=len(job.controls),
-        aovs=aovs_of(config.aov),
-        metrics=job.metrics,
-    )
+        renderer, space, model, task, facts, objective, spp, config.seed, searched=len(job.controls),
+        aovs=aovs_of(config.aov), metrics=job.metrics,
+    )  # fmt: skip
     for name in asked_by(job.objective):
         problem.asked(problem.whole(problem.domain.start))(name)  # refuses what is not there
     problem.steps, problem.draws = search_size(config, problem)
@@ -345,32 +275,31 @@ def _task(job: AttackParts, *, shows: bool = True) -> tuple[Task, Callable[[Desc
     """The task on the model, which with `shows` sees a clean picture where it asks for one, and what gives it facts."""
     config, (model, warnings) = job.config, job.loaded
     asked = job.task.seeking(job.objective) if isinstance(job.objective, str) else job.task
-    task = task_for(asked, model).on(model, target=config.target, minimise=config.minimise)
-    facts = partial(facts_of, job.scene, config.object, config)
+    task = judging.task_for(asked, model).on(model, target=config.target, minimise=config.minimise)
+    facts = partial(judging.facts_of, job.scene, config.object, config)
     several = task if isinstance(task, Together) else None
     tasks = list[Task]()
     for part, network in zip(several.tasks, several.models, strict=True) if several else [(task, model)]:
         known = several.told(part, facts(dict)) if several else facts(dict)
-        check_truth(part, network, job.scene, known, config)
-        tasks.append(shown(part, network, [job.scene], config) if shows else part)
+        judging.check_truth(part, network, job.scene, known, config)
+        tasks.append(judging.shown(part, network, [job.scene], config) if shows else part)
         warnings += [remark for remark in tasks[-1].remarks if remark not in warnings]
     task = replace(several, tasks=tuple(tasks)) if several else tasks[0]
     return each_thing(task) if config.judge == ALL else task, facts
 
 
 def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
-    """Return the steps of a search, and how many conditions each looks at, where neither was asked for."""
     if problem.conditions is None:
-        return config.steps or STEPS, 1
-    usual = OVER_ONE if problem.conditions.dim == 1 else OVER_PREDICTED
-    predicted = reason_against(problem, config.steps or usual[0], config.specialise) is None
-    balls = any(block.norm != "box" for block in problem.domain.blocks)
-    steps, draws = usual if predicted else OVER_RENDERED if balls else OVER_NUMBERS
+        return config.steps or numbers.STEPS, 1
+    usual = numbers.OVER_ONE if problem.conditions.dim == 1 else numbers.OVER_PREDICTED
+    if reason_against(problem, config.steps or usual[0], config.specialise) is not None:  # they are rendered
+        boxes = all(block.norm == "box" for block in problem.domain.blocks)
+        usual = numbers.OVER_NUMBERS if boxes else numbers.OVER_RENDERED
+    steps, draws = usual
     return config.steps or steps, config.draws or draws
 
 
 def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
-    """Whether a file can name a task or a policy, with all of its options."""
     try:
         return bool(make(as_setting(entry)) == entry)
     except InputError:
@@ -450,38 +379,62 @@ def attack(
     options = {name: value for name, value in settings.items() if value is not None}
     task = make_task(task) if callable(task) else task
     loaded_already = not all(isinstance(network, (str, Path)) for network in (scene, *several(model)))
-    if loaded_already or callable(objective) or only_here(controls) or only_here(over) or isinstance(task, OwnTask):
-        check_not_spread(options)
+    if (
+        loaded_already
+        or callable(objective)
+        or loading.only_here(controls)
+        or loading.only_here(over)
+        or isinstance(task, OwnTask)
+    ):
+        naming.check_not_spread(options)
+
+    def policy_of(setting: Any) -> Policy[Any]:
+        asked = AttackConfig(object="mug", policy=setting)
+        return make_policy(asked.policy_name, **asked.policy_options)
+
     if not isinstance(policy, (str, Mapping, Policy)) or not policy:
         raise InputError(
             f"policy: expected a name, a mapping with a `name` and options, or an instance, got {told(policy)}"
         )
-    scene = _scene(scene, object, settings)
+    if isinstance(scene, Scene):
+        naming.check_not_of_scene({**settings, "object": object})
+    else:
+        named = {name: settings[name] for name in naming.OF_SCENE if name in settings}
+        place = SceneConfig(**{"object": "mug", **named})
+        light, more = place.environment, naming.told_of_scene(place)
+        if object is not None:
+            scene = loading.load_scene(object, light, scene=scene, **more)
+        elif isinstance(scene, Mapping):
+            raise InputError("object: which shape of the scene is it? Give its id")
+        else:
+            scene = loading.load_scene(scene, light, **more)
+    own_name = str(getattr(objective, "__name__", None) or type(objective).__name__)  # where it is the caller's
+    own_name = f"own {own_name}" if own_name in OBJECTIVE_KINDS else own_name  # never as one of ours
     fixed: dict[str, float | str] = scene.description.given_values
     if settings.get("exposure"):  # the option says it
         fixed.pop("camera.exposure", None)
     described = {
-        **scene_as_settings(scene),
+        **loading.scene_as_settings(scene),
         "model": ",".join(map(model_name, several(model))),
-        "controls": settings_of(controls),
-        "over": settings_of(over),
+        "controls": loading.settings_of(controls),
+        "over": loading.settings_of(over),
         "task": as_setting(task) if isinstance(task, Task) else task,
-        "objective": _own_name(objective) if callable(objective) else objective,
+        "objective": own_name if callable(objective) else objective,
         "policy": as_setting(policy) if isinstance(policy, Policy) else policy,
         "set": fixed,
-        "metrics": metrics_as_settings(metrics or {}),
+        "metrics": judging.metrics_as_settings(metrics or {}),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     losses.check_aim(objective, targeted=config.target is not None)
-    parts = [f"the model {model_name(network)}" for network in several(model) if exists_here(network)]
+    parts = [f"the model {model_name(network)}" for network in several(model) if naming.exists_here(network)]
     parts += ["the scene"] if scene.only_here else []
     parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
     parts += [f"the objective {config.objective}"] if callable(objective) else []
-    parts += [f"the policy {policy.name}"] if isinstance(policy, Policy) and not is_named(policy, _policy_of) else []
-    parts += [f"the control {name}" for name in (*only_here(controls), *only_here(over))]
-    parts += [f"the metric {name}" for name in metrics_only_here(config.metrics)]
+    parts += [f"the policy {policy.name}"] if isinstance(policy, Policy) and not is_named(policy, policy_of) else []
+    parts += [f"the control {name}" for name in (*loading.only_here(controls), *loading.only_here(over))]
+    parts += [f"the metric {name}" for name in judging.only_here(config.metrics)]
     if config.workers is not None or config.cluster is not None:
-        check_shared(config.metrics)
+        judging.check_shared(config.metrics)
     config = config.with_only_here(parts)
     if config.is_matrix and config.ensemble is None:
         raise InputError(
@@ -501,30 +454,6 @@ def attack(
     stopped = run_path(run) if resume and run is not None and is_run(run_path(run)) else None
     with begun(config) if run is not None and stopped is None else nullcontext(stopped) as folder:
         loaded = models_as_one(model, config, asked)
-        measured = load_metrics(config.metrics, metrics)
+        measured = judging.load_metrics(config.metrics, metrics)
         job = AttackParts(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None, measured)
         return carry_out(job, watcher(progress), folder)
-
-
-def _own_name(objective: Callable[..., Tensor]) -> str:
-    """What an objective of the caller's is called; never as one of ours."""
-    name = str(getattr(objective, "__name__", None) or type(objective).__name__)
-    return f"own {name}" if name in OBJECTIVE_KINDS else name
-
-
-def _policy_of(setting: str | Mapping[str, Any]) -> Policy[Any]:
-    config = AttackConfig(object="mug", policy=setting)
-    return make_policy(config.policy_name, **config.policy_options)
-
-
-def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, settings: Mapping[str, Any]) -> Scene:
-    if isinstance(scene, Scene):
-        check_not_of_scene({**settings, "object": object})
-        return scene
-    config = SceneConfig(**{"object": "mug", **{name: settings[name] for name in OF_SCENE if name in settings}})
-    more = told_of_scene(config)
-    if object is not None:
-        return load_scene(object, config.environment, scene=scene, **more)
-    if isinstance(scene, Mapping):
-        raise InputError("object: which shape of the scene is it? Give its id")
-    return load_scene(scene, config.environment, **more)

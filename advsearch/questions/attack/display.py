@@ -16,40 +16,11 @@ from advsearch.questions.attack.summary import (
     EpsilonBudget,
     MatrixResult,
 )
+from advsearch.report import shown as saying
+from advsearch.report import wording as words
 from advsearch.report.figures import BLUE
-from advsearch.report.shown import (
-    ENDED,
-    NO_PROOF,
-    WHY,
-    Claim,
-    Column,
-    ResultPart,
-    ShownResult,
-    average_claim,
-    case_claim,
-    claim,
-    counted,
-    extent_of,
-    nothing_claimed,
-    searches_text,
-    share_text,
-)
-from advsearch.report.wording import (
-    COMMAND,
-    count,
-    interval_text,
-    margin_text,
-    number_text,
-    percent,
-    prediction_cells,
-    rated_cells,
-    short_name,
-    tally,
-)
+from advsearch.report.shown import Claim, Column, ResultPart, ShownResult
 from advsearch.runs.results import ControlGroup, VerifiedRate
-
-NOT_VERIFIED = ("not verified", "")  # Cells of what was not rendered afresh
-
 
 AttackResults = AttackSummary | CurveResult | MatrixResult
 
@@ -62,10 +33,29 @@ def shown(result: AttackResults) -> ShownResult:
 
 
 def claims(result: AttackResults) -> Iterator[Claim]:
-    """Yield what the run stands for."""
     if isinstance(result, CurveResult):
-        return _claims_of_curve(result)
-    return _claims_of_matrix(result) if isinstance(result, MatrixResult) else _claims_of_attack(result)
+        yield from _claims_of_curve(result)
+    elif isinstance(result, MatrixResult):
+        for row in result.table:
+            for cell in row.tested:
+                at_home = cell.model == row.attacked
+                spent = saying.searches_text(row.renders, result.policy, False) if at_home else None
+                name = f"searched on {row.attacked}, tried on {cell.model}"
+                yield saying.case_claim(name, cell.ending, cell.verified, spent)
+    else:
+        rate, verdict = result.verified, wording.attack_verdict(result)
+        extent = saying.extent_of("fresh renders that count as a success", rate)
+        if result.ending == "found" and rate is not None and rate.successes:
+            text = f"{verdict} How many such configurations there are is not known."
+            yield saying.claim("found", text, extent)
+        elif result.ending in saying.ENDED and rate is not None:
+            spent = saying.searches_text(result.renders, result.policy, result.baseline is not None)
+            yield saying.claim("not found", f"{verdict} Searched were {spent}. {saying.NO_PROOF}", extent)
+        else:
+            unknown = f"the search ended as {result.ending!r} without trials that carry a claim"
+            yield saying.nothing_claimed(saying.WHY.get(result.ending, unknown), verdict)
+        if result.average is not None:
+            yield saying.average_claim(result.average, wording.budget_text(result))
 
 
 # ---- one attack -----------------------------------------------------------------------------------------------------
@@ -82,11 +72,11 @@ def _shown_attack(summary: AttackSummary) -> ShownResult:
         "changed": wording.changed_text(summary),
         "objective": wording.objective_text(summary),
         "printable": wording.print_cost_text(summary),
-        "over": wording.over_text(summary),
+        "over": f"{' and '.join(summary.over)}, drawn anew for every picture" if summary.over else "",
         "along the drive": wording.drive_text(summary),
         "smallest": wording.smallest_text(summary),
         "failures": failures_text(summary.failures) if summary.failures else "",
-        "search": f"{summary.policy}, {count(summary.steps, 'step')}: {summary.ending}",
+        "search": f"{summary.policy}, {words.count(summary.steps, 'step')}: {summary.ending}",
         "renders": wording.renders_text(summary),
         "environment": "",  # the page has it, and the seed
         "seed": "",
@@ -97,27 +87,26 @@ def _shown_attack(summary: AttackSummary) -> ShownResult:
 def _rates(summary: AttackSummary) -> ResultPart:
     def rate(what: str, rated: VerifiedRate | ControlGroup | None) -> Sequence[str]:
         if rated is None:
-            return NOT_VERIFIED
+            return "not verified", ""
         number = rated.correct if isinstance(rated, ControlGroup) else rated.successes
-        return tally(what, number, rated.trials, rated.not_a_number), interval_text(rated.interval)
+        return words.tally(what, number, rated.trials, rated.not_a_number), words.interval_text(rated.interval)
 
     clean, baseline, average, success = summary.clean, summary.baseline, summary.average, wording.success(summary)
-    rows = [["clean", *prediction_cells(summary.task, clean), *rate("right", clean.control)]]
+    rows = [["clean", *words.prediction_cells(summary.task, clean), *rate("right", clean.control)]]
     if summary.adversarial:
-        cells = prediction_cells(summary.task, summary.adversarial)
+        cells = words.prediction_cells(summary.task, summary.adversarial)
         rows.append(["adversarial", *cells, *rate(success, summary.verified)])
     if baseline:
         rows.append(["random search", f"{baseline.renders} pictures", "", *rate(success, baseline.verified)])
     if average:
-        right = tally("right", average.correct, average.configurations)
-        drawn = count(average.configurations, "configuration")
-        rows.append(["average case", drawn, "", right, interval_text(average.interval)])
-    number = "action" if summary.task == COMMAND else "probability"
+        right = words.tally("right", average.correct, average.configurations)
+        drawn = words.count(average.configurations, "configuration")
+        rows.append(["average case", drawn, "", right, words.interval_text(average.interval)])
+    number = "action" if summary.task == words.COMMAND else "probability"
     return ResultPart(heads=("", "prediction", number, "rate", "95 % interval"), rows=rows)
 
 
 def ambient_part(summary: AttackSummary) -> list[ResultPart]:
-    """Return a table of the ambient light that was tried; none where none was."""
     light = summary.ambient
     if light is None:
         return []
@@ -126,8 +115,8 @@ def ambient_part(summary: AttackSummary) -> list[ResultPart]:
     text = f"Works up to {light.holds_to:.3g} lux, {more:.3g} times the light that is there, and {ends}."
     columns: Mapping[str, Column] = {
         "ambient light": "{0.lux:.3g} lux",
-        "wrong": lambda point: tally(wording.success(summary), point.verified.successes, point.verified.trials),
-        "95 % interval": lambda point: interval_text(point.verified.interval),
+        "wrong": lambda point: words.tally(wording.success(summary), point.verified.successes, point.verified.trials),
+        "95 % interval": lambda point: words.interval_text(point.verified.interval),
         "": lambda point: "holds" if point.holds else "ends",
     }
     note = "Exposure follows the ambient light: the projector alone is darker beside it."
@@ -135,31 +124,28 @@ def ambient_part(summary: AttackSummary) -> list[ResultPart]:
 
 
 def failures_text(known: DifferentFailures) -> str:
-    """Return how many different failures there are, and which of that is verified."""
-    where = f"{known.found} of {count(known.seen, 'draw')}"
+    where = f"{known.found} of {words.count(known.seen, 'draw')}"
     if known.places is not None:
         where = f"{known.found} of {known.places} cells over {' and '.join(known.over)} ({known.seen} were seen)"
     if (share := known.share) is not None:
-        where += f"; of all configurations {interval_text(share.interval)} fail in one render (95 % interval)"
-        where += "" if share.estimate is None else f", {percent(share.estimate)} by the estimate"
+        where += f"; of all configurations {words.interval_text(share.interval)} fail in one render (95 % interval)"
+        where += "" if share.estimate is None else f", {words.percent(share.estimate)} by the estimate"
     if not known.tried:
         return f"claimed in {where}; none of these was tried with fresh renders"
     return f"claimed in {where}; with fresh renders {known.held} of the {known.tried} that were tried hold"
 
 
 def failures_part(known: DifferentFailures, *, tried: bool = False) -> ResultPart:
-    """Return a table of the failures that are listed, or of those that were tried."""
-
     def held(failure: DifferentFailure) -> str:
         if (rate := failure.verified) is None:
             return "not tried"
-        return f"{'yes' if failure.holds else 'no'}, {rate.successes} of {count(rate.trials, 'render')}"
+        return f"{'yes' if failure.holds else 'no'}, {rate.successes} of {words.count(rate.trials, 'render')}"
 
     columns: Mapping[str, Column] = {
         "failures": range_text,
         "most often predicted": most_predicted,
         "holds in fresh renders": held,
-        "objective": lambda failure: number_text(failure.objective),
+        "objective": lambda failure: words.number_text(failure.objective),
     }
     return ResultPart.table((failure for failure in known.listed if not tried or failure.verified is not None), columns)
 
@@ -170,29 +156,13 @@ def range_text(failure: DifferentFailure) -> str:
     for name, ends in failure.ranges.items():
         value = failure.configuration.get(name)
         unit = "" if value is None or value.unit in ("", "1") else f" {value.unit}"
-        lies = ends if isinstance(ends, str) else f"{number_text(ends[0])} to {number_text(ends[1])}{unit}"
+        lies = ends if isinstance(ends, str) else f"{words.number_text(ends[0])} to {words.number_text(ends[1])}{unit}"
         texts.append(f"{name} {lies}")
     return ", ".join(texts) or "anywhere"
 
 
 def most_predicted(failure: DifferentFailure) -> str:
-    """Return the most frequent wrong prediction of its trials; empty where there is none."""
     return next(iter(failure.verified.labels), "") if failure.verified else ""
-
-
-def _claims_of_attack(result: AttackSummary) -> Iterator[Claim]:
-    rate, verdict = result.verified, wording.attack_verdict(result)
-    extent = extent_of("fresh renders that count as a success", rate)
-    if result.ending == "found" and rate is not None and rate.successes:
-        yield claim("found", f"{verdict} How many such configurations there are is not known.", extent)
-    elif result.ending in ENDED and rate is not None:
-        spent = searches_text(result.renders, result.policy, result.baseline is not None)
-        yield claim("not found", f"{verdict} Searched were {spent}. {NO_PROOF}", extent)
-    else:
-        why = WHY.get(result.ending, f"the search ended as {result.ending!r} without trials that carry a claim")
-        yield nothing_claimed(why, verdict)
-    if result.average is not None:
-        yield average_claim(result.average, wording.budget_text(result))
 
 
 # ---- robust accuracy against epsilon --------------------------------------------------------------------------------
@@ -207,8 +177,8 @@ def _shown_curve(result: CurveResult) -> ShownResult:
     by_epsilon: Mapping[str, Column] = {
         "epsilon": lambda point: plain_epsilon(point.epsilon) or "own",
         "robust": "{0.robust}/{0.objects}",
-        "accuracy": lambda point: percent(point.accuracy),
-        "95 % interval": lambda point: interval_text(point.interval),
+        "accuracy": lambda point: words.percent(point.accuracy),
+        "95 % interval": lambda point: words.interval_text(point.interval),
         "wrong already": "{0.already_wrong}",
     }
     by_object: Mapping[str, Column] = {
@@ -219,20 +189,18 @@ def _shown_curve(result: CurveResult) -> ShownResult:
         "wrong": lambda row: f"{row.verified.successes}/{row.verified.trials}" if row.verified else "",
         "margin": lambda row: "" if row.margin is None else f"{row.margin:.2f}",
     }
-    points = _points(result)
+    known = [point for point in result.curve if point.accuracy is not None]
+    points = [point for point in known if point.epsilon is not None]
     listed = "; ".join(f"{point.robust} of {point.objects} at {point.epsilon:g}" for point in points)
     chart = ResultPart(
-        "Robust accuracy",
-        [f"Over epsilon with 95 % intervals: {listed}."],
-        draw=lambda axes: _draw_curve(result, axes),
-        size=(5.6, 3.6),
+        "Robust accuracy", [f"Over epsilon with 95 % intervals: {listed}."],
+        draw=lambda axes: _draw_curve(result, points, axes), size=(5.6, 3.6),
         only="page" if len(points) > 1 else "notebook",
-    )
-    known = [point for point in result.curve if point.accuracy is not None]
+    )  # fmt: skip
     curve = ResultPart.table(known, by_epsilon, title="" if len(points) > 1 else chart.title, note=CURVE_NOTE)
     runs = [row.run for row in result.table]
     objects = ResultPart.table(result.table, by_object, title="The objects, at the last epsilon tried", parts=runs)
-    meaning = ResultPart(text=[f"Margin: {margin_text(result.task)}, in the trials of the worst case."])
+    meaning = ResultPart(text=[f"Margin: {words.margin_text(result.task)}, in the trials of the worst case."])
     sections = [*([chart] if points else []), *([curve] if known else []), objects, meaning]
     return ShownResult(_curve_text(result, known), sections, {"model": result.model, "policy": result.policy})
 
@@ -255,14 +223,12 @@ def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
 
 
 def plain_epsilon(value: EpsilonBudget) -> str:
-    """Return an epsilon as text, by control where there are more; empty of none."""
     if isinstance(value, dict):
         return ",".join(f"{name}={plain_epsilon(epsilon)}" for name, epsilon in value.items())
-    return "" if value is None else number_text(value)
+    return "" if value is None else words.number_text(value)
 
 
-def _draw_curve(result: CurveResult, axes: Any) -> None:
-    points = _points(result)
+def _draw_curve(result: CurveResult, points: Sequence[CurvePoint], axes: Any) -> None:
     at, accuracy = [point.epsilon for point in points], [point.accuracy for point in points]
     low, high = ([point.interval[end] for point in points] for end in (0, 1))
     axes.fill_between(at, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval")
@@ -273,26 +239,22 @@ def _draw_curve(result: CurveResult, axes: Any) -> None:
     axes.legend()
 
 
-def _points(result: CurveResult) -> list[CurvePoint]:
-    return [point for point in result.curve if point.epsilon is not None and point.accuracy is not None]
-
-
 def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
     total: Counter[str] = Counter()
     for row in result.table:
         total.update(row.renders or {})
-    searched = searches_text(total, result.policy, bool(total["baseline"]))
+    searched = saying.searches_text(total, result.policy, bool(total["baseline"]))
     spent = f"Searched were, of all objects and epsilons together, {searched}. "
     for point in result.curve:
         if point.accuracy is None:
             continue
-        extent = counted("objects without a failure", point.robust, point.objects, point.interval)
+        extent = saying.counted("objects without a failure", point.robust, point.objects, point.interval)
         where = "the controls' own budget" if point.epsilon is None else f"epsilon {point.epsilon:g}"
         text = (
-            f"Within {where} the policy {result.policy} found no failure of {share_text(extent)} objects; "
-            f"{point.already_wrong} are wrong as they are. {spent if total else ''}{NO_PROOF}"
+            f"Within {where} the policy {result.policy} found no failure of {saying.share_text(extent)} objects; "
+            f"{point.already_wrong} are wrong as they are. {spent if total else ''}{saying.NO_PROOF}"
         )
-        yield claim("measured", text, extent)
+        yield saying.claim("measured", text, extent)
 
 
 # ---- attacked on against tested on ----------------------------------------------------------------------------------
@@ -301,13 +263,13 @@ def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
 def _shown_matrix(result: MatrixResult) -> ShownResult:
     """The matrix, with a row for the clean scene; the stronger a cell's colour, the more successes."""
     marks = {"found": " *", "already wrong": " (wrong already)"}
-    heads = ["attacked on", "ending", *(f"tested on {short_name(tried.model)}" for tried in result.tested)]
-    right = [f"right {', '.join(rated_cells(tried.clean))}" for tried in result.tested]
+    heads = ["attacked on", "ending", *(f"tested on {words.short_name(tried.model)}" for tried in result.tested)]
+    right = [f"right {', '.join(words.rated_cells(tried.clean))}" for tried in result.tested]
     rows = [["clean scene", "", *right]] if right else []
     before, shares = len(rows), dict[tuple[int, int], float]()
     for up, row in enumerate(result.table, before):
-        cells = [", ".join(rated_cells(cell.verified)) + marks.get(cell.ending, "") for cell in row.tested]
-        rows.append([short_name(row.attacked), row.ending, *cells])
+        cells = [", ".join(words.rated_cells(cell.verified)) + marks.get(cell.ending, "") for cell in row.tested]
+        rows.append([words.short_name(row.attacked), row.ending, *cells])
         shares |= {(up, across): cell.verified.rate for across, cell in enumerate(row.tested, 2)}
     spp = f", {result.tested[0].spp} samples per pixel" if result.tested else ""
     note = (
@@ -350,16 +312,8 @@ def _draw_matrix(result: MatrixResult, axes: Any) -> None:
                 "white" if rates[up][across] > 0.6 else "black",
             )
             axes.text(across, up, text, ha="center", va="center", color=colour)
-    names = [short_name(tried.model) for tried in result.tested]
+    names = [words.short_name(tried.model) for tried in result.tested]
     axes.set_xticks(range(len(names)), names, rotation=20 if max(map(len, names)) > 12 else 0)
-    axes.set_yticks(range(len(rows)), [short_name(row.attacked) for row in rows])
+    axes.set_yticks(range(len(rows)), [words.short_name(row.attacked) for row in rows])
     axes.set(xlabel="tested on", ylabel="attacked on")
     axes.set_title(f"{', '.join(result.objects)}, {', '.join(result.controls)}: wrong in trials")
-
-
-def _claims_of_matrix(result: MatrixResult) -> Iterator[Claim]:
-    for row in result.table:
-        for cell in row.tested:
-            spent = searches_text(row.renders, result.policy, False) if cell.model == row.attacked else None
-            name = f"searched on {row.attacked}, tried on {cell.model}"
-            yield case_claim(name, cell.ending, cell.verified, spent)

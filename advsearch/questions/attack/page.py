@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,37 +15,21 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageSequence
 
-from advsearch.questions.attack import wording
-from advsearch.questions.attack.display import (
-    ambient_part,
-    failures_part,
-    failures_text,
-    most_predicted,
-    range_text,
-    shown,
-)
-from advsearch.questions.attack.summary import AttackSummary, FoundValue
+from advsearch.questions.attack import display, wording
+from advsearch.questions.attack.summary import AttackSummary
+from advsearch.report import wording as words
 from advsearch.report.figures import search_axes
-from advsearch.report.shown import Picture, ResultPart
-from advsearch.report.wording import (
-    SUCCESS_ABOVE_ZERO,
-    formation_text,
-    marks_text,
-    number_text,
-    objective_label,
-    prediction_text,
-    seconds_text,
-)
+from advsearch.report.shown import Column, Picture, ResultPart
+from advsearch.report.wording import count, number_text
 from advsearch.runs import directory, files, store
-from advsearch.runs.results import Result
+from advsearch.runs.results import GroupDerivative, PlannedGradient, Result
 from advsearch.viewer.document import data_script, data_url
 from advsearch.viewer.pages import object_data, object_part, read_object, shown_page
 
 FRAME_QUALITY = 85  # Of the JPEG frames of the search, from 1 to 95
 MOST_TRIALS = 24  # Pictures of the verification that the page shows
 AT_THE_END = 1e-6  # Of a range: as near as that to one of its ends a value was stopped by it
-MARKED, FORMERLY_MARKED = "-prediction.png", "-answer.png"
-"""How files with marks end, and how those of runs that were made before do."""
+MARKED = "-prediction.png"  # How files with marks end
 
 
 def page(run: Path, result: Result) -> str | None:
@@ -53,7 +37,7 @@ def page(run: Path, result: Result) -> str | None:
     FileFormatError where the rows are damaged."""
     if not isinstance(result, AttackSummary):
         return None
-    given, thing = shown(result), read_object(run)
+    given, thing = display.shown(result), read_object(run)
     frames, curves = _read_frames(run / directory.IMAGES / "search.gif"), {}
     if (run / store.NAME).is_file():
         with store.Store(run / store.NAME, read_only=True) as stored:
@@ -66,16 +50,17 @@ def page(run: Path, result: Result) -> str | None:
         _textures(run),
         *_failures(result),
         _rates(result, given.sections[0]),
-        *ambient_part(result),
+        *display.ambient_part(result),
         _curve(result, curves),
         ResultPart("How the search worked", rows=worked, folded=True),
-        ResultPart(wording.plan_text(result), heads=wording.PLAN_HEADS, rows=wording.plan_rows(result), folded=True),
+        _plan(result.gradient_plan),
     ]
-    parts = ", ".join(f"{name} {seconds_text(value)}" for name, value in result.seconds.items() if name != "total")
+    times = {name: words.seconds_text(seconds) for name, seconds in result.seconds.items()}
+    total, parts = times.pop("total"), ", ".join(map(" ".join, times.items()))
     facts = {
         **given.facts,
-        "time": seconds_text(result.seconds["total"]) + (f" ({parts})" if parts else ""),
-        "image formation": formation_text(result.image_formation),
+        "time": f"{total} ({parts})" if parts else total,
+        "image formation": words.formation_text(result.image_formation),
         "environment": result.environment,
         "seed": str(result.seed),
     }
@@ -87,15 +72,13 @@ def page(run: Path, result: Result) -> str | None:
         objectives = [searched[step] if step < len(searched) else None for step in steps]
         data = [data_script({"pictures": frames, "steps": steps, "objectives": objectives}, "frames"), *data]
     scripts = ["make.js", "attack.js", *(["object.js"] if thing else [])]
-    return shown_page(
-        run, result, replace(given, sections=sections, facts=facts, about=about), data=data, scripts=scripts
-    )
+    given = replace(given, sections=sections, facts=facts, about=about)
+    return shown_page(run, result, given, data=data, scripts=scripts)
 
 
 def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[ResultPart]:
-    """What the model sees, and what it predicts; trials of the verification, the search, and frames along a drive."""
     predictions = {
-        name: "no prediction recorded" if predicted is None else prediction_text(summary.task, predicted)
+        name: "no prediction recorded" if predicted is None else words.prediction_text(summary.task, predicted)
         for name, predicted in (("clean", summary.clean), ("adversarial", summary.adversarial))
     }
 
@@ -113,14 +96,12 @@ def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[
     yield ResultPart("What the model sees", pictures=[seen], note=note)
     yield ResultPart(live="compare")
     kept = run / directory.IMAGES
-    ends = MARKED if (kept / f"clean{MARKED}").is_file() else FORMERLY_MARKED
-    if (kept / f"clean{ends}").is_file():
-        yield ResultPart("What it predicts", pictures=[pair(ends)], layout="large", note=marks_text(summary.task))
+    if (kept / f"clean{MARKED}").is_file():
+        marks = words.marks_text(summary.task)
+        yield ResultPart("What it predicts", pictures=[pair(MARKED)], layout="large", note=marks)
     trials = sorted(file.name for file in kept.glob("verification*.png"))
-    trials = ([name for name in trials if name.endswith(ends)] or trials)[:MOST_TRIALS]
-    numbers = [name.removesuffix(ends).removeprefix("verification").removesuffix(".png").strip("-_") for name in trials]
-    small = [Picture(f"images/{name}", f"trial {number}") for name, number in zip(trials, numbers, strict=True)]
-    if small:
+    trials = ([name for name in trials if name.endswith(MARKED)] or trials)[:MOST_TRIALS]
+    if small := [Picture(f"images/{name}", f"trial {''.join(filter(str.isdigit, name))}") for name in trials]:
         yield ResultPart("Pictures of the verification", pictures=[small], layout="small", folded=True)
     if animated:
         yield ResultPart("The search, step by step", live="search")
@@ -132,13 +113,18 @@ def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[
 
 
 def _changes(summary: AttackSummary) -> ResultPart:
-    """The adversarial configuration in a few values, each beside its range where it has one."""
     rows, bars = [], []
     for name, changed in (summary.configuration or {}).items():
         clean = "" if changed.clean is None else number_text(changed.clean)
         values = changed.value if isinstance(changed.value, list) else [changed.value]
         unit = "" if changed.unit in ("", "1", "name") else f" {changed.unit}"
-        within, bar = _in_range(changed)
+        low, high, value, within, bar = changed.low, changed.high, changed.value, "", None
+        if low is not None and high is not None and isinstance(value, (int, float)):
+            stopped = min(value - low, high - value) <= AT_THE_END * (high - low)
+            within = f"{number_text(low)} to {number_text(high)}{', at its end' if stopped else ''}"
+            begin = changed.clean if isinstance(changed.clean, (int, float)) else value
+            ends = (min(begin, value), max(begin, value), value)
+            bar = tuple(min(max((end - low) / (high - low), 0.0), 1.0) for end in ends)
         rows.append([name, clean, ", ".join(map(number_text, values)) + unit, within])
         bars.append(bar)
     heads = ("parameter", "clean", "adversarial", "in its range")
@@ -147,27 +133,13 @@ def _changes(summary: AttackSummary) -> ResultPart:
         "What was changed" if rows else "",
         heads=[heads[at] for at in kept],
         rows=[[row[at] for at in kept] for row in rows],
-        bars=bars if len(kept) == len(heads) else (),
+        bars=bars if len(kept) == len(heads) else (),  # type: ignore[arg-type]
     )
-
-
-def _in_range(changed: FoundValue) -> tuple[str, tuple[float, float, float] | None]:
-    low, high, value = changed.low, changed.high, changed.value
-    if low is None or high is None or not isinstance(value, (int, float)):
-        return "", None
-    stopped = min(value - low, high - value) <= AT_THE_END * (high - low)
-    text = f"{number_text(low)} to {number_text(high)}{', at its end' if stopped else ''}"
-    clean = changed.clean if isinstance(changed.clean, (int, float)) else value
-    begin, end, mark = (
-        min(max((at - low) / (high - low), 0.0), 1.0) for at in (min(clean, value), max(clean, value), value)
-    )
-    return text, (begin, end, mark)
 
 
 def _textures(run: Path) -> ResultPart:
-    """The texture of the object, and of every other mesh (`texture@NAME.png`), before and after."""
-    names = sorted(file.name for file in (run / directory.ARTIFACTS).glob("texture*-original.png"))
-    before = [name for name in names if re.fullmatch(r"texture(@[\w-]+)?-original\.png", name)]
+    files = sorted((run / directory.ARTIFACTS).glob("texture*-original.png"))
+    before = [file.name for file in files if re.fullmatch(r"texture(@[\w-]+)?-original\.png", file.name)]
     pictures = []
     for original in before:
         changed = f"artifacts/{original.removesuffix('-original.png')}.png"
@@ -180,24 +152,21 @@ def _textures(run: Path) -> ResultPart:
 def _failures(summary: AttackSummary) -> Iterator[ResultPart]:
     if (known := summary.failures) is None:
         return
-    pictures = [
-        Picture(
-            failure.picture,
-            range_text(failure),
-            prediction_text(summary.task, failure.pictured) if failure.pictured else most_predicted(failure),
-        )
-        for failure in known.listed
-        if failure.picture and failure.holds
-    ]
-    text = [f"Failures are {failures_text(known)}."]
-    yield replace(failures_part(known), title="Different failures", text=text, pictures=[pictures] if pictures else [])
+    pictures = []
+    for failure in known.listed:
+        if failure.picture and failure.holds:
+            says = words.prediction_text(summary.task, failure.pictured) if failure.pictured else ""
+            name = says or display.most_predicted(failure)
+            pictures.append(Picture(failure.picture, display.range_text(failure), name))
+    text, groups = [f"Failures are {display.failures_text(known)}."], [pictures] if pictures else []
+    yield replace(display.failures_part(known), title="Different failures", text=text, pictures=groups)
 
 
 def _rates(summary: AttackSummary, table: ResultPart) -> ResultPart:
     """The table of rates with bars, rates first, as a phone cuts what is on the right; empty if nothing was rated."""
-    baseline, average = summary.baseline, summary.average
+    average = summary.average
     rated = [summary.clean.control, *([summary.verified] if summary.adversarial else [])]
-    rated += [baseline.verified] if baseline else []
+    rated += [summary.baseline.verified] if summary.baseline else []
     bars = [None if rate is None else (*rate.interval, rate.rate) for rate in rated]
     bars += [(*average.interval, average.accuracy)] if average else []
     if not any(bars):
@@ -210,25 +179,40 @@ def _rates(summary: AttackSummary, table: ResultPart) -> ResultPart:
 
 def _curve(summary: AttackSummary, curves: dict[str, list[float | None]]) -> ResultPart:
     named = {summary.policy: curves.get("search", []), "random search": curves.get("baseline", [])}
-    numbers = {name: [value for value in values if value is not None] for name, values in named.items()}
-    numbers = {name: values for name, values in numbers.items() if values}
-    if not numbers:
+    named = {name: values for name, values in named.items() if any(value is not None for value in values)}
+    if not named:
         return ResultPart()
+    ends = {name: [value for value in values if value is not None] for name, values in named.items()}
     above = "right" if summary.minimises else wording.success(summary)
-    zero = f"above: {above}" if summary.objective in SUCCESS_ABOVE_ZERO else ""
-    listed = "; ".join(f"{name}: from {values[0]:.3g} to {max(values):.3g}" for name, values in numbers.items())
-    label = objective_label(summary.objective)
+    zero = f"above: {above}" if summary.objective in words.SUCCESS_ABOVE_ZERO else ""
+    listed = "; ".join(f"{name}: from {values[0]:.3g} to {max(values):.3g}" for name, values in ends.items())
+    label = words.objective_label(summary.objective)
     return ResultPart(
         "The search",
         [f"{label} over evaluations. {listed}"],
-        draw=partial(search_axes, {name: named[name] for name in numbers}, label, zero_means=zero),
+        draw=partial(search_axes, named, label, zero_means=zero),
         note="Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is "
         "verified.",
     )
 
 
+def _plan(plan: PlannedGradient) -> ResultPart:
+    def step(group: GroupDerivative) -> str:
+        unit = "" if group.unit in ("", "1") else f" {group.unit}"
+        wide = f"{group.step:.3g} of its range" if group.step_in_unit is None else f"{group.step_in_unit:.3g}{unit}"
+        return f"{wide}: {group.step_reason}" if group.step_reason else ""
+
+    columns: Mapping[str, Column] = {
+        "parameter": "{0.name}", "numbers": "{0.size}", "derivative": "{0.estimator}", "why": "{0.reason}",
+        "step": step,
+    }  # fmt: skip
+    spp = "" if plan.spp is None else f", {count(plan.spp, 'sample')} a pixel"
+    renders = f"{count(plan.renders_per_gradient, 'render')} a gradient beside the picture itself"
+    title = f"Gradient plan: {count(len(plan.groups), 'parameter')}, {renders}{spp}"
+    return ResultPart.table(plan.groups, columns, title=title, folded=True)
+
+
 def _read_frames(file: Path) -> list[str]:
-    """Return the frames of an animation as data URLs; none where it is missing or damaged."""
     frames = []
     try:
         with Image.open(file, formats=("GIF",)) as animation:

@@ -156,7 +156,6 @@ class AttackResult:
             known = ", ".join(["model", "scene", "camera", "settings", *RenderKeywords.__annotations__])
             raise TypeError(f"render() got an unexpected keyword argument {unknown[0]!r}; it takes {known}")
         parts = self.parts()
-        config = parts.config
         camera, settings = as_python(camera), as_python(settings)
         seen = parts.scene if scene is None else scene if isinstance(scene, Scene) else load_scene(scene)
         if isinstance(camera, Mapping):
@@ -165,16 +164,11 @@ class AttackResult:
             raise InputError(f"settings: the adversarial configuration says what {twice[0]} is; leave it out")
         seen = seen.with_settings(settings) if settings else seen
         seen = replace(seen, description=seen.description.seen_by(camera)) if camera else seen
-        as_before = pictures_of(config)
+        task = parts.task if model is not None else task_for(parts.task, parts.loaded[0])
         return render(
-            seen,
-            parts.loaded[0] if model is None else model,
-            task=parts.task if model is not None else task_for(parts.task, parts.loaded[0]),
-            label=config.label,
-            controls=parts.controls,
-            at=self.u,
-            **{**as_before, **options},
-        )
+            seen, parts.loaded[0] if model is None else model, task=task, label=parts.config.label,
+            controls=parts.controls, at=self.u, **{**pictures_of(parts.config), **options},
+        )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: not what only this session has."""
@@ -257,9 +251,10 @@ def trial_to_show(findings: Findings) -> int | None:
         return [trial.prediction.label for trial in trials]
 
     checked = findings.verification
-    clean = labels(findings.clean if checked is None else checked.clean_trials)
     if checked is None:
+        clean = labels(findings.clean)
         return clean.index(mode(clean)) if clean else None
+    clean = labels(checked.clean_trials)
     usual, usual_clean = mode(labels(checked.successes or checked.counting)), mode(clean)
     ranks = [
         (label == usual and outcome is bool(checked.successes), label == usual, beside == usual_clean)
@@ -269,7 +264,6 @@ def trial_to_show(findings: Findings) -> int | None:
 
 
 def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, shown: Mapping[str, KeptPicture]) -> None:
-    """Write the pictures of the clean and the adversarial scene, of their difference, of trials and of the search."""
     for name, kept in shown.items():
         run.save_image(name, kept.picture)
         run.save_exr(name, kept.radiance * problem.renderer.formation.gain)
@@ -293,7 +287,6 @@ def write_pictures(run: RunDirectory, problem: Problem, findings: Findings, show
 def save_trial(
     run: RunDirectory, problem: Problem, findings: Findings, trial: tuple[str, int], name: str, u: Tensor
 ) -> None:
-    """Write the picture of a trial, by kind and number, as the model saw it, and with its prediction."""
     seed, picture = seeds.stream(problem.seed, "verification", trial[1]), findings.pictures.get(trial)
     picture = problem.picture(u, seed, findings.spp) if picture is None else picture
     run.save_image(name, picture)
@@ -301,7 +294,6 @@ def save_trial(
 
 
 def save_marked(run: RunDirectory, name: str, picture: Tensor, marks: list[Mark]) -> None:
-    """Write ``<name>-prediction.png``, the picture with marks; nothing where there are none."""
     if marks:
         run.save_image(f"{name}-prediction", marked(picture.numpy(), marks))
 
@@ -335,15 +327,12 @@ FRAMES = 24
 STRIP, SIDE = 8, 160  # Pictures of a strip at most, and the height of each in pixels
 FASTEST = 40  # Milliseconds that a frame of an animation is shown at least
 
-Frames = list[npt.NDArray[np.float32]]
-
 
 def along_drive(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory | None) -> AlongDrive | None:
     """Look at an adversarial scene, and at the clean scene, at evenly spaced times of each path that varies by chance;
     None where none does. What varies beside it is as the scene comes."""
-    searched = problem.space.controls[: problem.searched]
-    place, path = sum(len(bound.start) for bound in searched), None
-    for control in problem.space.controls[len(searched) :]:
+    place, path = len(problem.domain.start), None
+    for control in problem.space.controls[len(problem.searched_space.controls) :]:
         if isinstance(control, PathControl) and any(
             slot.parameter.name == "time" and slot.width for slot in control.slots
         ):
@@ -367,7 +356,7 @@ def along_drive(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory 
     for name, at in (("drive-clean", start[: len(problem.domain.start)]), ("drive", u)):
         if at is None:
             continue
-        pictures, counts[name] = Frames(), 0
+        pictures, counts[name] = list[npt.NDArray[np.float32]](), 0
         for number, whole in enumerate(times):
             whole[: len(at)] = at
             with torch.no_grad():
@@ -378,20 +367,15 @@ def along_drive(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory 
         if run is not None:
             write_drive(run, name, pictures, seconds * max(1, len(ways)))
     return AlongDrive(
-        frames=len(times),
-        seconds=seconds,
-        paths=[str(way) for way in ways],
-        clean=counts["drive-clean"],
-        answer=counts.get("drive"),
-        spp=spp,
-    )
+        frames=len(times), seconds=seconds, paths=[str(way) for way in ways], clean=counts["drive-clean"],
+        answer=counts.get("drive"), spp=spp,
+    )  # fmt: skip
 
 
 def write_drive(run: RunDirectory, name: str, pictures: Sequence[npt.NDArray[np.float32]], seconds: float) -> None:
     """Write frames (h, w, 3) in sRGB as an animation, NAME.webp, and some side by side, NAME.png, into a run."""
-    frames = [Image.fromarray((picture * 255.0).round().clip(0, 255).astype(np.uint8)) for picture in pictures]
-    file = io.BytesIO()
-    pause = max(FASTEST, round(1000.0 * seconds / len(frames)))
+    frames = [Image.fromarray(files.to_8bit(picture)) for picture in pictures]
+    file, pause = io.BytesIO(), max(FASTEST, round(1000.0 * seconds / len(frames)))
     frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], duration=pause, loop=0, quality=80)
     write_bytes(run.path / IMAGES / f"{name}.webp", file.getvalue())
     size = max(1, round(frames[0].width * SIDE / frames[0].height)), SIDE

@@ -31,52 +31,35 @@ class AttackConfig(DerivativeConfig):
     # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
-        Clash(
-            "smallest", lambda asked: asked.epsilons,
-            "finds one epsilon by itself; give one `epsilon` as the largest, or none",
-        ),
-        Clash(
-            "smallest", lambda asked: asked.is_study,
-            "is about one object and one model; name one `object`, one `model`, and one `epsilon` as the largest",
-        ),
-        Clash(
-            "model", lambda asked: asked.is_matrix and asked.is_curve,
-            "several make a matrix, of one object and one epsilon; name one `object` and one `epsilon`, or one `model`",
-        ),
-        Clash(
-            "ensemble", lambda asked: len(split_names(asked.model)) < 2,
-            "is of several models; name them in `model`, separated by commas, or leave `ensemble` out",
-        ),
-        Clash(
-            "smallest", lambda asked: asked.seconds is not None,
-            "takes several searches; give `steps` for each, and leave `seconds` out",
-        ),
+        Clash("smallest", lambda asked: asked.epsilons,
+              "finds one epsilon by itself; give one `epsilon` as the largest, or none"),
+        Clash("smallest", lambda asked: asked.is_study,
+              "is about one object and one model; name one `object`, one `model`, and one `epsilon` as the largest"),
+        Clash("model", lambda asked: asked.is_matrix and asked.is_curve,
+              "several make a matrix, of one object and one epsilon; name one `object` and one `epsilon`, or one "
+              "`model`"),
+        Clash("ensemble", lambda asked: len(split_names(asked.model)) < 2,
+              "is of several models; name them in `model`, separated by commas, or leave `ensemble` out"),
+        Clash("smallest", lambda asked: asked.seconds is not None,
+              "takes several searches; give `steps` for each, and leave `seconds` out"),
         Clash("smallest", lambda asked: asked.over, "cannot be combined with `over` yet; leave one of them out"),
         Clash("smallest", lambda asked: asked.printable, "cannot be combined with `printable`; leave one of them out"),
         Clash("minimise", lambda asked: asked.is_curve, "has no robust accuracy; name one `object` and one `epsilon`"),
         Clash("minimise", lambda asked: asked.target, "makes the right answer easier to give; leave `target` out"),
         Clash("minimise", lambda asked: asked.smallest, "has no smallest change; leave `smallest` out"),
-        Clash(
-            "over", lambda asked: {*map(instance, asked.over)} & {*map(instance, asked.controls)},
-            "names a control that is searched already; leave it out of one of the two",
-        ),
-        Clash(
-            "draws",
-            lambda asked: not asked.over and asked.draws != OVER_RENDERED[1],  # which older run.yaml always say
-            "is how many conditions of `over` a step looks at, and there are none; add `over`, or leave `draws` out",
-        ),
-        Clash(
-            "estimators",
-            lambda asked: (
-                {name.partition(".")[0] for name in asked.estimators}
-                & {part for name in map(instance, asked.over) for part in (name, name.rpartition(":")[2])}
-            ),
-            "names a control that varies by chance, whose derivative nobody asks for; leave it out",
-        ),
-        Clash(
-            "average", lambda asked: asked.command == "attack" and asked.is_curve,
-            "is not part of a curve; `advsearch gap` compares with the average, or name one `object` and one `epsilon`",
-        ),
+        Clash("over", lambda asked: {*map(instance, asked.over)} & {*map(instance, asked.controls)},
+              "names a control that is searched already; leave it out of one of the two"),
+        Clash("draws", lambda asked: not asked.over and asked.draws != OVER_RENDERED[1],  # as older runs
+              "is how many conditions of `over` a step looks at, and there are none; add `over`, or leave `draws` out"),
+        Clash("estimators",
+              lambda asked: (
+                  {name.partition(".")[0] for name in asked.estimators}
+                  & {part for name in map(instance, asked.over) for part in (name, name.rpartition(":")[2])}
+              ),
+              "names a control that varies by chance, whose derivative nobody asks for; leave it out"),
+        Clash("average", lambda asked: asked.command == "attack" and asked.is_curve,
+              "is not part of a curve; `advsearch gap` compares with the average, or name one `object` and one "
+              "`epsilon`"),
     )
 
     object: str = setting_as_in(
@@ -94,8 +77,7 @@ class AttackConfig(DerivativeConfig):
         otherwise="each by itself",
     )
     measure: Literal["no", "quick", "full"] = setting(
-        "quick",
-        "search",
+        "quick", "search",
         "measure which gradient estimator is best on this scene; full also measures step and samples",
     )
     policy: str | dict[str, JsonValue] = setting(

@@ -98,14 +98,14 @@ class Attack:
     # ---- before the search ------------------------------------------------------------------------------------------
 
     def plan(self) -> None:
-        """Measure the gradient plan, or take the one that the run was begun with."""
         problem, config, stored = self.problem, self.config, self.journal.note(PLAN)
         if stored is not None:
             problem.plan = problem.plan.restored(stored["plan"])
             problem.spp, problem.search_depth = stored["spp"], stored.get("search_depth")
             return
         worth = config.specialise and (config.measure == "full" or problem.steps >= planning.WORTH_BOUNCES)
-        if worth and self.against_surface_light() is not None:  # else no step will be rendered
+        against = surface_light.reason_against(problem, problem.steps, self.policy, config.specialise)
+        if worth and against is not None:  # else no step will be rendered
             title, most = "finding how many bounces of light the search needs", planning.most_pictures(problem)
             hint = "few samples each; `specialise=false` leaves it out"
             self.stages.begin("setup", title, most, hint=hint, at_most=True)
@@ -116,7 +116,6 @@ class Attack:
         self.journal.set_note(PLAN, chosen)
 
     def _measure(self) -> None:
-        """Replace the first gradient plan by a measured one, as far as the preparation wants that."""
         problem, config, tick = self.problem, self.config, self.stages.progress.advance
         full = config.measure == "full"
         if config.measure == "no" or not self.policy.uses_gradient:
@@ -133,10 +132,8 @@ class Attack:
             renderer, problem.loss, u, seed=seed, spp=problem.spp, every=full, counted=counted, tick=tick
         )
         if full:
-            samples, hint = (
-                planning.cosine_samples(problem.plan),
-                "counted in samples a pixel; `measure=quick` leaves it out",
-            )
+            samples = planning.cosine_samples(problem.plan)
+            hint = "counted in samples a pixel; `measure=quick` leaves it out"
             self.stages.begin("setup", "choosing step and samples of gradients", samples, hint=hint, at_most=True)
             table = list(planning.cosines(renderer, problem.loss, u, seed=seed, tick=tick))
             problem.plan, spp = planning.tuned(problem.plan, table)
@@ -156,7 +153,20 @@ class Attack:
             return evaluation
 
         findings.first_look = run_trials(partial(map, look), start, spp=spp, seed=seed, trials=FIRST_LOOK)
-        self._check_look(start)
+
+        def values(trial: Judgement) -> list[float | None]:
+            return [finite(getattr(trial, name)) for name in LOOKED_AT]
+
+        # a model or an objective that says something else of the same pictures now is refused; one that does so each
+        # time can't be told by it
+        now, before = list(map(values, findings.first_look)), self.journal.note(LOOK)
+        if before is None:
+            self.journal.set_note(LOOK, now)
+        elif not all(map(same, before, now)):
+            again = problem.evaluate(Query(start, seeds.stream(seed, "verification", 0), spp=spp))
+            if same(values(again.said), now[0]):
+                both = zip(before[0], now[0], strict=True)
+                raise other_numbers(self.journal.run, dict(zip(LOOKED_AT, both, strict=True)))
         looks_right = any(trial.right for trial in findings.first_look)
         if not problem.rule.control or (looks_right and not config.smallest):
             return True
@@ -164,23 +174,6 @@ class Attack:
         self._verifier.begin("checking the clean scene with fresh renders", self._verifier.looks[0])
         self._verifier.try_clean()
         return not problem.rule.already_wrong(count_right(findings.clean, findings.spp))
-
-    def _check_look(self, start: Tensor) -> None:
-        """Note what was seen, or refuse a model or an objective that says something else of the same pictures now; one
-        that does so each time can't be told by it."""
-
-        def values(trial: Judgement) -> list[float | None]:
-            return [finite(getattr(trial, name)) for name in LOOKED_AT]
-
-        now, before = [values(trial) for trial in self.findings.first_look], self.journal.note(LOOK)
-        if before is None:
-            self.journal.set_note(LOOK, now)
-        elif not all(map(same, before, now)):
-            seed = seeds.stream(seeds.stream(self.problem.seed, "first look"), "verification", 0)
-            again = self.problem.evaluate(Query(start, seed, spp=self._asked_spp))
-            if same(values(again.said), now[0]):
-                both = zip(before[0], now[0], strict=True)
-                raise other_numbers(self.journal.run, dict(zip(LOOKED_AT, both, strict=True)))
 
     # ---- verification -----------------------------------------------------------------------------------------------
 
@@ -240,9 +233,10 @@ class Attack:
     # ---- searches ---------------------------------------------------------------------------------------------------
 
     def collect_transport(self) -> None:
-        """Make the matrix that predicts the pictures of the searches, where there can be one and it pays."""
         problem, steps, findings = self.problem, self.problem.steps, self.findings
-        matrix, surface = reason_against(problem, steps, self.config.specialise), self.against_surface_light()
+        specialise = self.config.specialise
+        matrix = reason_against(problem, steps, specialise)
+        surface = surface_light.reason_against(problem, steps, self.policy, specialise)
         if matrix is None and problem.conditions is None:
             self._prepare(Transport(problem, steps, clean=self.clean), "collecting light transport")
             return
@@ -258,15 +252,10 @@ class Attack:
         if matrix is None:
             self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
             return
-        too_short = not findings.surface_refused and not reason_against(problem, 1 << 30, self.config.specialise)
+        too_short = not findings.surface_refused and not reason_against(problem, 1 << 30, specialise)
         self._renders_because(matrix if too_short or surface == surface_light.NO_CAMERA else surface)
 
-    def against_surface_light(self) -> str | None:
-        """Why light on surfaces does not predict the search, in words; None if it may."""
-        return surface_light.reason_against(self.problem, self.problem.steps, self.policy, self.config.specialise)
-
     def _prepare(self, predictor: PredictedSearch, title: str) -> None:
-        """Make what predicts pictures; where its matrix would be too large, pictures are rendered."""
         hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
         self.stages.begin("transport", title, predictor.samples, hint=hint)
         self.findings.transport = predictor
@@ -277,13 +266,11 @@ class Attack:
             self._renders_because(str(error))
 
     def _renders_because(self, reason: str) -> None:
-        """Keep why the search renders, and say so where that needn't be."""
         self.findings.rendered_because = reason
         if text := remark(reason):
             self.stages.progress.message(text)
 
     def search_all(self) -> None:
-        """The search, the same without print terms where it has them, and the random one, each with as many renders."""
         config, findings, steps = self.config, self.findings, self.problem.steps
         self.begin("search", f"searching with {self.policy.name}", steps, "`steps` or `seconds` shorten it")
         seed, frames = self.problem.seed, findings.frames
@@ -300,16 +287,9 @@ class Attack:
         findings.baseline = self.search("baseline", make_policy("random"), steps, seeds.stream(seed, "baseline"))
 
     def search(
-        self,
-        kind: str,
-        policy: Policy[Any],
-        steps: int,
-        seed: int,
-        frames: list[Any] | None = None,
-        seconds: float | None = None,
-        domain: Domain | None = None,
-        ranked: bool = True,
-    ) -> SearchResult:
+        self, kind: str, policy: Policy[Any], steps: int, seed: int, frames: list[Any] | None = None,
+        seconds: float | None = None, domain: Domain | None = None, ranked: bool = True,
+    ) -> SearchResult:  # fmt: skip
         """Search, reading back what is stored already; `ranked` renders the best configurations again. Raises
         KeyboardInterrupt where it was interrupted; the result of an interrupted main search is kept before."""
         before, every = 0, max(1, -(-steps // MOST_FRAMES))
@@ -332,18 +312,10 @@ class Attack:
         transport = self.findings.transport
         exact, drawn = (transport.exact, transport.drawn) if transport is not None else (False, False)
         result = search(
-            evaluations,
-            replace(domain or self.problem.domain, exact=exact, drawn=drawn and policy.uses_gradient),
-            policy,
-            steps=steps,
-            seed=seed,
-            candidates=4 if ranked else 0,
-            close=self.config.close_looks,
-            late=self.journal.clock(kind, seconds),
-            on_step=on_step,
-            kind=kind,
-            noise=self.problem.seed,
-        )
+            evaluations, replace(domain or self.problem.domain, exact=exact, drawn=drawn and policy.uses_gradient),
+            policy, steps=steps, seed=seed, candidates=4 if ranked else 0, close=self.config.close_looks,
+            late=self.journal.clock(kind, seconds), on_step=on_step, kind=kind, noise=self.problem.seed,
+        )  # fmt: skip
         if result.ending is Ending.INTERRUPTED:
             self.findings.search = self.findings.search or result
             raise KeyboardInterrupt
@@ -389,7 +361,6 @@ def find_smallest(attack: Attack, verifier: Verifier) -> None:
         return results[-1].best_u
 
     def passes(u: Tensor, check: int, few: int = trials) -> bool:
-        """Whether all trials together pass; so `few` do without a failure."""
         allowed, scores, failures = problem.rule.allowed(trials), list[float](), 0
         while len(scores) < trials and failures <= allowed and (failures or len(scores) < few):
             (trial,) = verifier.trials(f"check {check}", {len(scores): u})
@@ -417,7 +388,6 @@ def find_smallest(attack: Attack, verifier: Verifier) -> None:
 
 
 def _rank(verification: Verification) -> tuple[bool, float, float]:
-    """How bad a configuration is for the model: found, then the rate of successes, then the mean margin."""
     scores = [trial.score for trial in verification.counting]
     mean = sum(scores) / len(scores)
     return verification.ending is Ending.FOUND, verification.adversarial.rate, mean if mean == mean else -math.inf

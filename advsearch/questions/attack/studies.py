@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -31,25 +32,11 @@ from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.errors import ClusterError, FileFormatError
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
-from advsearch.question import Asked, carry_out
-from advsearch.questions.attack.carry_out import (
-    LOADING,
-    attack_once,
-    check_from_config,
-    executor_for,
-    problem_from_config,
-)
+from advsearch.question import Asked, Made, carry_out
+from advsearch.questions.attack import carry_out as attacking
+from advsearch.questions.attack import summary as results
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import (
-    AttackSummary,
-    CurvePoint,
-    CurveResult,
-    MatrixCell,
-    MatrixModel,
-    MatrixResult,
-    MatrixRow,
-    ObjectRow,
-)
+from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
 from advsearch.runs import files
 from advsearch.runs.directory import CONFIG, PARTS, default_name, is_run
 from advsearch.runs.files import PART, storage_errors, write_bytes
@@ -101,31 +88,29 @@ def chains_of(config: AttackConfig) -> list[Chain]:
     """Return the attacks of a study: of a gap, a matrix or a curve. Raises InputError where none of the controls takes
     a setting, or a name comes twice."""
     chains: list[Chain] = []
-    if config.command != "gap" and config.is_matrix:
-        names = different(config.models, "model")
-        for place, name in enumerate([ALL] if config.ensemble else names):
-            alone = AttackConfig.of(config, **({} if config.ensemble else {"model": name}))
-            chains.append([StudyAttack(alone, f"{place:02d}-" + default_name(name, []), name)])
-        return chains
     if config.command == "gap":
         check_run_settings(config)
-    for place, name in enumerate(different(config.objects, "object")):
-        if config.command == "gap":
+        for place, name in enumerate(different(config.objects, "object")):
             for number, (control, settings) in enumerate(config.controls.items()):
                 changes = {"controls": {control: settings}, **settings_alone(config, control, settings)}
                 folder = f"{place:02d}-{number:02d}-" + default_name(name, [control])
                 chains.append([StudyAttack(AttackConfig.of(config, object=name, **changes), folder, control)])
-            continue
-        chains.append([])
-        for epsilon in _epsilons(config):
-            words = [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
-            changed = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
-            chains[-1].append(StudyAttack(changed, f"{place:02d}-" + default_name(name, words), name, epsilon))
+    elif config.is_matrix:
+        names = different(config.models, "model")
+        for place, name in enumerate([ALL] if config.ensemble else names):
+            alone = AttackConfig.of(config, **({} if config.ensemble else {"model": name}))
+            chains.append([StudyAttack(alone, f"{place:02d}-" + default_name(name, []), name)])
+    else:
+        for place, name in enumerate(different(config.objects, "object")):
+            chains.append([])
+            for epsilon in _epsilons(config):
+                words = [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
+                changed = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
+                chains[-1].append(StudyAttack(changed, f"{place:02d}-" + default_name(name, words), name, epsilon))
     return chains
 
 
 def _epsilons(config: AttackConfig) -> list[float | None]:
-    """The epsilons of a curve, from the smallest; None is the own of each control."""
     return [*sorted(config.epsilons)] or [None]
 
 
@@ -141,7 +126,7 @@ def attacks_of(settings: JsonObject) -> Call:
             for part in chains[numbers[0]]:
                 path = Path(folder) / part.name
                 config_there = part.config.model_copy(update={"run": str(path), "overwrite": True})
-                ending = attack_once(config_there, clean=clean).summary.ending
+                ending = attacking.attack_once(config_there, clean=clean).summary.ending
                 kept = (file for file in path.rglob("*") if file.is_file() and file.name != files.NAME)
                 read = {file.relative_to(path).as_posix(): file.read_bytes() for file in kept}
                 carried_out.append((part.name, str(path), read))
@@ -208,11 +193,9 @@ class StudyRun:
 
     @property
     def interrupted(self) -> bool:
-        """Whether there was an interrupt."""
         return self.asked.ending == INTERRUPTED
 
     def attack(self, study: StudyAttack, clean: CleanMatrix | None = None) -> AttackSummary | None:
-        """Return the summary of one attack, or None if there was an interrupt; `clean` as for `attack_once`."""
         if self.interrupted:
             return None
         config, path = study.config, self.run.path / PARTS / study.name
@@ -221,7 +204,7 @@ class StudyRun:
         what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
         self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
         summary = carry_out_part(
-            path, config, self.progress, lambda there, **more: attack_once(there, clean=clean, **more).summary
+            path, config, self.progress, lambda there, **more: attacking.attack_once(there, clean=clean, **more).summary
         )
         if not isinstance(summary, AttackSummary):
             raise FileFormatError(f"{path}: expected the run of an attack, got one of {summary.command}")
@@ -229,6 +212,9 @@ class StudyRun:
         if summary.ending == INTERRUPTED:
             self.asked.ending = INTERRUPTED
         return None if self.interrupted else summary
+
+    def result(self, kind: type[Made], **fields: Any) -> Made:
+        return self.asked.result(kind, parts=self.names, warnings=self.warnings, **fields)
 
 
 # ---- several objects or epsilons, and several models ----------------------------------------------------------------
@@ -244,7 +230,7 @@ def curve(asked: Asked[AttackConfig]) -> CurveResult:
     study = StudyRun(asked)
     rows = []
     for chain in study.chains:
-        row, clean = ObjectRow(object=chain[0].of, clean=None, flips_at=None), CleanMatrix()
+        row, clean = results.ObjectRow(object=chain[0].of, clean=None, flips_at=None), CleanMatrix()
         renders: Counter[str] = Counter()
         for part in chain:
             summary = study.attack(part, clean)
@@ -252,29 +238,19 @@ def curve(asked: Asked[AttackConfig]) -> CurveResult:
                 break
             renders.update(summary.renders)
             epsilon = summary.epsilon if part.epsilon is None else part.epsilon
-            row = ObjectRow(
-                object=part.of,
-                clean=summary.clean.control,
-                ending=summary.ending,
-                epsilon=epsilon,
-                flips_at=epsilon if summary.ending == "found" else None,
-                verified=summary.verified,
-                margin=summary.verified.margin if summary.verified else None,
-                run=summary.run,
-                tried=part.epsilon,
-                renders=dict(renders),
-            )
+            more = {"object": part.of, "clean": summary.clean.control, "tried": part.epsilon, "epsilon": epsilon}
+            more |= {"flips_at": epsilon if summary.ending == "found" else None, "renders": dict(renders)}
+            margin = summary.verified and summary.verified.margin
+            row = results.ObjectRow.of({**vars(summary), **more, "margin": margin})
             if row.ending in SETTLED:
                 break
         rows.append(row)
     epsilons = _epsilons(asked.config)
     points = [_accuracy(rows, epsilon) for epsilon in epsilons]
-    return asked.result(
-        CurveResult, epsilons=epsilons, table=rows, curve=points, parts=study.names, warnings=study.warnings
-    )
+    return study.result(CurveResult, epsilons=epsilons, table=rows, curve=points)
 
 
-def _known(row: ObjectRow, epsilon: float | None) -> bool:
+def _known(row: results.ObjectRow, epsilon: float | None) -> bool:
     """Whether a row says anything about an epsilon: it was tried there, or had flipped before. What ended without a
     number does not, nor an object whose own noise makes it wrong too often for any scene to be verified."""
     if row.ending in (None, "non-finite objective"):
@@ -285,21 +261,17 @@ def _known(row: ObjectRow, epsilon: float | None) -> bool:
     return steady and (epsilon is None or (row.tried is not None and row.tried >= epsilon))
 
 
-def _accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
+def _accuracy(rows: Sequence[results.ObjectRow], epsilon: float | None) -> results.CurvePoint:
     known = [row for row in rows if _known(row, epsilon)]
     wrong = sum(row.ending == "already wrong" for row in known)
     flips = [row.flips_at for row in known if row.ending == "found"]
     found = sum(epsilon is None or (isinstance(flips_at, float) and flips_at <= epsilon) for flips_at in flips)
     robust = len(known) - wrong - found
-    return CurvePoint(
-        epsilon=epsilon,
-        objects=len(known),
-        robust=robust,
-        found=found,
-        already_wrong=wrong,
+    return results.CurvePoint(
+        epsilon=epsilon, objects=len(known), robust=robust, found=found, already_wrong=wrong,
         accuracy=robust / len(known) if known else None,
         interval=clopper_pearson(robust, len(known)) if known else (0.0, 1.0),
-    )
+    )  # fmt: skip
 
 
 LEAST_SPP = 64  # Samples a pixel of the trials, where none of the attacks needed more and nothing was asked for
@@ -313,15 +285,15 @@ def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
     success needs the model to be right on the clean scene with the same seed, as everywhere.
     """
     config, names = asked.config, different(asked.config.models, "model")
-    asked.progress.stage(LOADING)
+    asked.progress.stage(attacking.LOADING)
     for name in names:
-        check_from_config(_alone(config, name))
+        attacking.check_from_config(_alone(config, name))
 
     study = StudyRun(asked)
     summaries = {part.of: study.attack(part) for (part,) in study.chains}
     attacked = {name: summary for name, summary in summaries.items() if summary is not None}
-    models: list[MatrixModel] = []
-    cells: dict[str, list[MatrixCell]] = {}
+    models: list[results.MatrixModel] = []
+    cells: dict[str, list[results.MatrixCell]] = {}
     configurations = {  # of those in which something was searched
         name: torch.from_numpy(read_configuration(Path(summary.run)))
         for name, summary in attacked.items()
@@ -329,22 +301,21 @@ def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
     }
     if configurations and not study.interrupted:
         counts = [summary.sample_count.spp for summary in attacked.values() if summary.sample_count]
-        spp = config.verify_spp or max([LEAST_SPP, *counts])
+        spp, worker = config.verify_spp or max([LEAST_SPP, *counts]), "advsearch.questions.attack.studies:models_worker"
         with asked.until_interrupted():
             study.progress.stage("loading the models to try the scenes on")
-            problems = {name: problem_from_config(_alone(config, name))[0] for name in names}
+            conditions = []
+            for name in names:
+                problem, _ = attacking.problem_from_config(_alone(config, name))
+                conditions.append(RetrialCondition(name, problem, spp, problem.renderer.formation.resolution))
             seed, trials = seeds.stream(config.seed, "matrix"), config.trial_count
-            with executor_for(config, "advsearch.questions.attack.studies:models_worker", study.progress) as executor:
-                conditions = [
-                    RetrialCondition(name, problem, spp, problem.renderer.formation.resolution)
-                    for name, problem in problems.items()
-                ]
+            with attacking.executor_for(config, worker, study.progress) as executor:
                 retrials = Retrials(conditions, study.run, study.progress, trials=trials, seed=seed, executor=executor)
                 each = trials * len(names)
                 hint = f"{each} predictions; `trials` or `verify_spp` shorten it"
                 study.progress.stage("trying the clean scene on every model", each, hint=hint)
                 models = [
-                    MatrixModel(
+                    results.MatrixModel(
                         model=condition.name,
                         labels=list(condition.problem.task.truth_names(condition.problem.truth())),
                         input_size=condition.problem.renderer.formation.resolution,
@@ -355,30 +326,22 @@ def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
                 ]
                 for name, u in configurations.items():
                     study.progress.stage(f"trying the scene against {name} on every model", each, hint=hint)
-                    checked = {condition.name: retrials.adversarial(name, u, condition) for condition in conditions}
+                    tried = {condition.name: retrials.adversarial(name, u, condition) for condition in conditions}
                     cells[name] = [
-                        MatrixCell(model=model, ending=tried.ending.value, verified=verified_rate(tried))
-                        for model, tried in checked.items()
+                        results.MatrixCell(model=model, ending=checked.ending.value, verified=verified_rate(checked))
+                        for model, checked in tried.items()
                     ]
     rows = [
-        MatrixRow(attacked=name, ending=by.ending, run=by.run, renders=by.renders, tested=cells.get(name, []))
+        results.MatrixRow(attacked=name, ending=by.ending, run=by.run, renders=by.renders, tested=cells.get(name, []))
         for name, by in attacked.items()
     ]
-    return asked.result(
-        MatrixResult,
-        models=list(names),
-        ensemble=config.ensemble,
-        tested=models,
-        table=rows,
-        parts=study.names,
-        warnings=study.warnings,
-    )
+    return study.result(MatrixResult, models=list(names), ensemble=config.ensemble, tested=models, table=rows)
 
 
 def models_worker(settings: JsonObject) -> Call:
     """Return what evaluates queries of the models of a configuration: what a worker does."""
     config = AttackConfig(**settings)
-    return worker_call(cache(lambda name: problem_from_config(_alone(config, name))[0]))
+    return worker_call(cache(lambda name: attacking.problem_from_config(_alone(config, name))[0]))
 
 
 def _alone(config: AttackConfig, name: str) -> AttackConfig:

@@ -27,16 +27,17 @@ from advsearch.runs.results import (
     StudyResult,
     VariedValue,
     VerifiedRate,
-)  # fmt: skip
+    optional,
+)
 from advsearch.runs.summary import NAME, other_summary, read_result
 
 
 class FoundValue(DescribedValue):
     """One value of the adversarial configuration, and where it lies."""
 
-    clean: int | float | str | None = Field(default=None, description="the clean scene's; absent of several numbers")
-    low: float | None = Field(default=None, description="the least that the control allows; absent without a range")
-    high: float | None = Field(default=None, description="the most")
+    clean: int | float | str | None = optional("the clean scene's; absent of several numbers")
+    low: float | None = optional("the least that the control allows; absent without a range")
+    high: float | None = optional("the most")
 
 
 class PicturedPrediction(Fields):
@@ -45,10 +46,8 @@ class PicturedPrediction(Fields):
     label: str
     index: int | None = Field(description="of the class")
     probability: JsonFloat | None = Field(description="of this prediction; of a detector the score of the box")
-    payload: Payload = Field(default=None, description="what else the task keeps of it; absent without")
-    trial: int | None = Field(
-        default=None, description="number of the trial, the same for both pictures; absent where nothing was tried"
-    )
+    payload: Payload = optional("what else the task keeps of it; absent without")
+    trial: int | None = optional("number of the trial, the same for both pictures; absent where nothing was tried")
 
 
 class CleanPrediction(CleanScene, PicturedPrediction):
@@ -120,7 +119,7 @@ class DifferentFailure(Fields):
     holds: bool | None = Field(description="whether it is verified; null if it was not tried")
     verified: VerifiedRate | None = Field(description="trials that ended as soon as that was clear; null: not tried")
     picture: str | None = Field(description="the first of these trials; null if there is none")
-    pictured: PicturedPrediction | None = Field(default=None, description="of that picture; absent if there is none")
+    pictured: PicturedPrediction | None = optional("of that picture; absent if there is none")
 
 
 class FailingShare(Fields):
@@ -139,7 +138,7 @@ class DifferentFailures(Fields):
     found: int = Field(description="cells in which the search saw a success, or such draws: its own claim")
     seen: int = Field(description="cells, or draws, that it looked at")
     places: int | None = Field(description="cells that there are; null where there are none")
-    share: FailingShare | None = Field(default=None, description="null where it can't be told")
+    share: FailingShare | None = optional("null where it can't be told")
     tried: int = Field(description="failures that were tried with fresh seeds")
     held: int = Field(description="of these, verified")
     listed: list[DifferentFailure] = Field(description="the worst, then whichever is farthest from all before it")
@@ -208,9 +207,7 @@ class Printability(Fields):
 
     clean: PrintTerms = Field(description="of the clean scene")
     answer: PrintTerms | None = Field(description="of the adversarial scene; null if nothing was searched")
-    cost: PrintCost | None = Field(
-        default=None, description="what the terms cost in margin; null if nothing was verified, and in older runs"
-    )
+    cost: PrintCost | None = optional("what the terms cost in margin; null if nothing was verified, and in older runs")
 
 
 class AmbientPoint(Fields):
@@ -255,34 +252,27 @@ class AttackSummary(SceneResult):
     clean: CleanPrediction
     adversarial: PicturedPrediction | None = Field(description="of what the search found; null if nothing was searched")
     verified: VerifiedRate | None = Field(description="trials of the adversarial scene; null if nothing was verified")
-    tried_objective: TriedObjective | None = Field(default=None, description="the objective over these trials")
-    baseline: BaselineSearch | None = Field(default=None, description="the random search; absent without `baseline`")
-    answer_from: str | None = Field(
-        default=None, description="`random` where the run's adversarial scene is the random search's"
+    tried_objective: TriedObjective | None = optional("the objective over these trials")
+    baseline: BaselineSearch | None = optional("the random search; absent without `baseline`")
+    answer_from: str | None = optional("`random` where the run's adversarial scene is the random search's")
+    policy_verified: VerifiedRate | None = optional("of what the policy itself found then")
+    drive: AlongDrive | None = optional("[along a drive](drives.md), with `over` a path; absent without")
+    ambient: AmbientLight | None = optional(
+        "with [a projector](controls/projector.md) that is found: how much other light it bears"
     )
-    policy_verified: VerifiedRate | None = Field(default=None, description="of what the policy itself found then")
-    drive: AlongDrive | None = Field(
-        default=None, description="[along a drive](drives.md), with `over` a path; absent without"
+    average: AverageCase | None = optional("only with `average`")
+    smallest: SmallestEpsilon | None = optional("only with `smallest`")
+    printability: Printability | None = optional("only with `printable`")
+    distribution: SearchDistribution | None = optional("of a policy that finds one")
+    failures: DifferentFailures | None = optional("of a policy that looks for different ones")
+    sample_count: VerificationSamples | None = optional("of the verification")
+    transport: LinearTransport | None = optional(
+        "whether [a matrix of light transport](transport.md) predicted the searches' pictures"
     )
-    ambient: AmbientLight | None = Field(
-        default=None,
-        description="with [a projector](controls/projector.md) that is found: how much other light it bears",
-    )
-    average: AverageCase | None = Field(default=None, description="only with `average`")
-    smallest: SmallestEpsilon | None = Field(default=None, description="only with `smallest`")
-    printability: Printability | None = Field(default=None, description="only with `printable`")
-    distribution: SearchDistribution | None = Field(default=None, description="of a policy that finds one")
-    failures: DifferentFailures | None = Field(default=None, description="of a policy that looks for different ones")
-    sample_count: VerificationSamples | None = Field(default=None, description="of the verification")
-    transport: LinearTransport | None = Field(
-        default=None, description="whether [a matrix of light transport](transport.md) predicted the searches' pictures"
-    )
-    claimed: SearchClaim | None = Field(default=None, description="what the search itself believes")
-    gradients: SearchGradients | None = Field(default=None, description="of the search")
-    configuration: dict[str, FoundValue] | None = Field(
-        default=None, description="the adversarial configuration in a few values"
-    )
-    shared: SharedWork | None = Field(default=None, description="only with `workers` or `cluster`")
+    claimed: SearchClaim | None = optional("what the search itself believes")
+    gradients: SearchGradients | None = optional("of the search")
+    configuration: dict[str, FoundValue] | None = optional("the adversarial configuration in a few values")
+    shared: SharedWork | None = optional("only with `workers` or `cluster`")
     renders: dict[str, int] = Field(
         description="of the search, its gradients, the baseline and the verification; `unprinted`: of the search "
         "without print terms, with its gradients; `products`: predicted instead"
@@ -313,16 +303,16 @@ class ObjectRow(Fields):
     object: str
     clean: ControlGroup | None
     ending: str | None = None
-    epsilon: EpsilonBudget = Field(default=None, description="of the last attack")
+    epsilon: EpsilonBudget = optional("of the last attack")
     flips_at: EpsilonBudget = Field(
         description="the least epsilon at which an adversarial scene was found; null: at none"
     )
     verified: VerifiedRate | None = None
-    margin: JsonFloat | None = Field(default=None, description="mean of the trials, in logits")
+    margin: JsonFloat | None = optional("mean of the trials, in logits")
     run: str | None = None
-    tried: float | None = Field(default=None, description="the largest epsilon that was tried")
-    renders: dict[str, int] | None = Field(
-        default=None, description="pictures by kind, of the attacks at all epsilons together; null in older runs"
+    tried: float | None = optional("the largest epsilon that was tried")
+    renders: dict[str, int] | None = optional(
+        "pictures by kind, of the attacks at all epsilons together; null in older runs"
     )
 
 

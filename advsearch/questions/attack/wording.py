@@ -7,22 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.report.wording import (
-    CLASSIFICATION,
-    COMMAND,
-    SUCCESS_ABOVE_ZERO,
-    calling,
-    calls,
-    count,
-    margin_text,
-    number_text,
-    objective_name,
-    rate_text,
-    seconds_text,
-    wanted,
-    with_article,
-)
-from advsearch.runs.results import PrintTerms, VerifiedRate
+from advsearch.report import wording as words
+from advsearch.report.wording import count, number_text
+from advsearch.runs.results import VerifiedRate
 
 PATH = "path"  # The control whose conditions are moments
 NORMS = {"linf": "the largest change of any value", "l2": "the root of the sum of all squared changes"}
@@ -39,17 +26,21 @@ _REASONS = {
 def attack_verdict(summary: AttackSummary) -> str:
     """Return what the run found, in one sentence that holds on its own."""
     ending, verified = summary.ending, summary.verified
-    thing, after = f"this {noun(summary)}", f"after {count(summary.steps, 'step')}"
+    # the object, or the thing beside it that is judged: `wine glass` for `wine-glass`, `mug` for `data/mug.obj`
+    called = PurePath(summary.object).stem if summary.judge in ("object", "all") else summary.judge
+    thing = "this " + called.replace("-", " ").replace("_", " ")
+    thing += " or a thing beside it" if summary.judge == "all" else ""
+    after = f"after {count(summary.steps, 'step')}"
     if ending == "already wrong":
-        wrong = calls(summary.task, thing, summary.clean.label)
+        wrong = words.calls(summary.task, thing, summary.clean.label)
         return f"The model already {wrong}: nothing was changed and nothing counts as found."
     if verified is None and ending == "interrupted" and summary.adversarial:
-        says = calls(summary.task, thing, summary.adversarial.label)
+        says = words.calls(summary.task, thing, summary.adversarial.label)
         return f"Interrupted {after}. What was found so far is not verified: the model {says}."
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} {after}; nothing is verified."
     several_paths = summary.drive is not None and len(summary.drive.paths) > 1
-    rate = rate_text(verified) + another_text(summary.over, several_paths)
+    rate = words.rate_text(verified) + another_text(summary.over, several_paths)
     claim, sought = _clauses(summary, thing)
     if ending == "found":
         random = summary.baseline.verified if summary.baseline else None
@@ -76,7 +67,6 @@ def another_text(over: Sequence[str], paths: bool = False) -> str:
 
 
 def remarks(summary: AttackSummary) -> list[str]:
-    """Return what has to be known beside the verdict: the control group, the random search, the run's warnings."""
     texts = []
     control, verified, beaten = summary.clean.control, summary.verified, summary.policy_verified
     random = summary.baseline.verified if summary.baseline else None
@@ -89,7 +79,7 @@ def remarks(summary: AttackSummary) -> list[str]:
         tally = f"{beaten.successes} of {beaten.trials} with a margin of {beaten.margin:.2f}"
         texts.append(
             f"The random search beside it found a worse configuration than the policy did ({tally}); that of the "
-            f"random search is the scene. The margin is {margin_text(summary.task)}."
+            f"random search is the scene. The margin is {words.margin_text(summary.task)}."
         )
     elif verified is not None and random is not None and random.rate >= verified.rate and random.rate > 0:
         tally, better = f"{random.successes} of {random.trials}", random.rate > verified.rate
@@ -98,31 +88,20 @@ def remarks(summary: AttackSummary) -> list[str]:
     return texts + summary.warnings
 
 
-def noun(summary: AttackSummary) -> str:
-    """Return what the object, or the thing beside it that is judged, is called: ``wine glass`` for ``wine-glass`` and
-    ``mug`` for ``data/mug.obj``."""
-    called = PurePath(summary.object).stem if summary.judge in ("object", "all") else summary.judge
-    every = " or a thing beside it" if summary.judge == "all" else ""
-    return called.replace("-", " ").replace("_", " ") + every
-
-
 def success(summary: AttackSummary) -> str:
-    """Return one word for a trial that counts: ``wrong``, ``target`` or ``easier``."""
     return "target" if summary.target else "easier" if summary.minimises else "wrong"
 
 
 def goal_text(summary: AttackSummary) -> str:
-    """Return what was asked for, where it was not just any wrong prediction."""
     if summary.target:
-        verb = "command" if summary.task == COMMAND else "predict"
+        verb = "command" if summary.task == words.COMMAND else "predict"
         return f"the model should {verb} {' or '.join(summary.target)}"
     return "easier to recognise" if summary.minimises else ""
 
 
 def objective_text(summary: AttackSummary) -> str:
-    """Return what came of an objective that is no margin, over the trials; empty where there is nothing to say."""
     tried = summary.tried_objective
-    if tried is None or summary.objective in SUCCESS_ABOVE_ZERO:
+    if tried is None or summary.objective in words.SUCCESS_ABOVE_ZERO:
         return ""
     parts = [
         f"{name} {values.mean:.3g} (from {values.low:.3g} to {values.high:.3g})"
@@ -132,13 +111,7 @@ def objective_text(summary: AttackSummary) -> str:
     return f"{summary.objective} in the trials: {', '.join(parts)}" if parts else ""
 
 
-def over_text(summary: AttackSummary) -> str:
-    """Return what varied by chance: ``camera and environment, drawn anew for every picture``."""
-    return f"{' and '.join(summary.over)}, drawn anew for every picture" if summary.over else ""
-
-
 def drive_text(summary: AttackSummary) -> str:
-    """Return in how many frames of a drive the model is right; empty where none was looked at."""
     drive = summary.drive
     if drive is None:
         return ""
@@ -148,7 +121,6 @@ def drive_text(summary: AttackSummary) -> str:
 
 
 def smallest_text(summary: AttackSummary) -> str:
-    """Return the bracket of the smallest epsilon; empty if it was not asked for."""
     bracket = summary.smallest
     if bracket is None:
         return ""
@@ -212,20 +184,20 @@ def print_cost_text(summary: AttackSummary) -> str:
 def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str, claim: str) -> str:
     """Return "The model calls this mug a vase" where that is known of every trial, a weaker clause otherwise."""
     labels = verified.labels
-    if summary.task == COMMAND and not summary.target and not summary.minimises and len(labels) == 1:
+    if summary.task == words.COMMAND and not summary.target and not summary.minimises and len(labels) == 1:
         where = next(iter(labels)).replace("action outside its envelope ", "")
         claim += f" {where}" if where else ""
-    if summary.minimises or summary.task == COMMAND:
+    if summary.minimises or summary.task == words.COMMAND:
         return claim[:1].upper() + claim[1:]
     if len(labels) == 1:
-        return f"The model {calls(summary.task, thing, next(iter(labels)))}"
+        return f"The model {words.calls(summary.task, thing, next(iter(labels)))}"
     if labels:
         most = max(labels, key=lambda label: labels[label])
         what = "takes {} for one of the targets" if summary.target else "is wrong about {}"
-        return f"The model {what.format(thing)}, most often {calling(summary.task, most)},"
-    if summary.task != CLASSIFICATION:
+        return f"The model {what.format(thing)}, most often {words.calling(summary.task, most)},"
+    if summary.task != words.CLASSIFICATION:
         return f"The model is wrong about {thing}"
-    called = with_article(summary.adversarial.label) if summary.adversarial else "something else"
+    called = words.with_article(summary.adversarial.label) if summary.adversarial else "something else"
     return f"The model takes {thing} for something else ({called})"
 
 
@@ -233,76 +205,66 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
     """Return what a trial counts as, and what was looked for: "the model is wrong about this mug", "makes the model
     miss this mug". Of a commanded action no more is said: nothing has moved."""
     target = summary.target or []
-    names, called = " or ".join(target), " or ".join(map(with_article, target))
+    names, called = " or ".join(target), " or ".join(map(words.with_article, target))
     if summary.minimises:
         return (
             f"the model recognises {thing}, more surely than in the clean scene,",
             f"makes {thing} easier to recognise",
         )
-    if summary.task == COMMAND:
+    if summary.task == words.COMMAND:
         verbs, envelope = ("reached", "reach"), f"the envelope of {names}"
         if not target:
             verbs, envelope = ("left", "leave"), "its envelope"
         return f"the commanded action {verbs[0]} {envelope}", f"makes the commanded action {verbs[1]} {envelope}"
     if target:
-        claim = f"calls {thing} {called}" if summary.task == CLASSIFICATION else f"predicts {names}"
+        claim = f"calls {thing} {called}" if summary.task == words.CLASSIFICATION else f"predicts {names}"
         return f"the model {claim}", f"makes the model call {thing} {called}"
     claim = "it is wrong" if summary.ending in _REASONS else f"the model is wrong about {thing}"
-    return claim, wanted(summary.objective, thing)
+    return claim, words.wanted(summary.objective, thing)
 
 
 # ---- how it came to its result ---------------------------------------------------------------------------------------
 
-PLAN_HEADS = ("parameter", "numbers", "derivative", "why", "step")
-
 
 def method_facts(summary: AttackSummary) -> dict[str, str]:
-    """Return what is known of the search's work by name; texts of what is not known are empty."""
+    facts = dict[str, str]()
     claimed, chosen, seen = summary.claimed, summary.sample_count, summary.gradients
     segments, nothing, terms = summary.light_path_segments, summary.non_finite, summary.printability
-    claim = samples = gradients = cut = not_finite = printed = ""
     if claimed is not None:
-        claim = f"{objective_name(summary.objective)} {_short(claimed.objective)} in the render that won"
-        if math.isfinite(claimed.re_evaluated):
-            claim += f", {_short(claimed.re_evaluated)} when rendered again"
+        again = f", {_short(claimed.re_evaluated)} when rendered again" if math.isfinite(claimed.re_evaluated) else ""
+        claim = f"{words.objective_name(summary.objective)} {_short(claimed.objective)} in the render that won"
+        facts["The search's claim"] = claim + again
     if chosen is not None:
         enough = "more would leave the " + ("rate about where it is" if summary.over else "margin on its side")
-        samples = f"{chosen.spp} a pixel in the verification; "
-        samples += enough if chosen.converged else "that more would not change it is not shown"
+        enough = enough if chosen.converged else "that more would not change it is not shown"
+        facts["Sample count"] = f"{chosen.spp} a pixel in the verification; {enough}"
+    facts["Light transport"] = transport_text(summary)
     if seen is not None and seen.count:
         gradients = f"{seen.count} of the search" + (f", {seen.zero} of them zero" if seen.zero else "")
         cosine = seen.cosine_with_the_one_before
-        if cosine is not None and math.isfinite(cosine):
-            gradients += f", median cosine with the one before {cosine:.2f}"
+        known = cosine is not None and math.isfinite(cosine)
+        facts["Gradients"] = gradients + (f", median cosine with the one before {cosine:.2f}" if known else "")
     if seen is not None and (seen.count or seen.rejected):  # what the policy did about outliers and failed steps
         cut = f"{count(seen.cut, 'gradient')} with single outliers cut, {seen.shortened} shortened as a whole, "
-        cut += f"{count(seen.rejected, 'step')} taken back"
+        facts["Cut or taken back"] = f"{cut}{count(seen.rejected, 'step')} taken back"
     if nothing.objectives or nothing.gradient_elements:
-        not_finite = (
-            f"{count(nothing.objectives, 'objective')}, {count(nothing.gradient_elements, 'number')} of gradients"
-        )
+        numbers = count(nothing.gradient_elements, "number")
+        facts["Not finite"] = f"{count(nothing.objectives, 'objective')}, {numbers} of gradients"
+    longest = f"at most {segments.search} segments in the search, {segments.verification} in the verification"
+    facts["Light paths"] = longest
     if terms is not None:
-        printed = f"clean: {_terms_text(terms.clean)}"
-        printed += "" if terms.answer is None else f"; answer: {_terms_text(terms.answer)} (sRGB)"
-    return {
-        "The search's claim": claim,
-        "Sample count": samples,
-        "Light transport": transport_text(summary),
-        "Gradients": gradients,
-        "Cut or taken back": cut,
-        "Not finite": not_finite,
-        "Light paths": f"at most {segments.search} segments in the search, {segments.verification} in the verification",
-        "Printability": printed,
-        "Cost of printability": print_cost_text(summary),
-        "Moved before": ", ".join(
-            f"{moved.parameter} from {number_text(moved.scene)} to {number_text(moved.used)} {moved.unit}".rstrip()
-            for moved in summary.clean.moved
-        ),
-    }
-
-
-def _terms_text(terms: PrintTerms) -> str:
-    return f"step between neighbours {terms.variation:.3g}, distance from printable colours {terms.off_print:.3g}"
+        far = [
+            f"{of}: step between neighbours {off.variation:.3g}, distance from printable colours {off.off_print:.3g}"
+            for of, off in (("clean", terms.clean), ("answer", terms.answer))
+            if off is not None
+        ]
+        facts["Printability"] = "; ".join(far) + (" (sRGB)" if terms.answer else "")
+    facts["Cost of printability"] = print_cost_text(summary)
+    moved = [
+        f"{value.parameter} from {number_text(value.scene)} to {number_text(value.used)} {value.unit}".rstrip()
+        for value in summary.clean.moved
+    ]
+    return {**facts, "Moved before": ", ".join(moved)}
 
 
 def _short(value: float) -> str:
@@ -310,7 +272,6 @@ def _short(value: float) -> str:
 
 
 def transport_text(summary: AttackSummary) -> str:
-    """Return whether a matrix predicted the pictures of the searches, and how far it was off; empty: not known."""
     transport = summary.transport
     if transport is None:
         return ""
@@ -319,32 +280,13 @@ def transport_text(summary: AttackSummary) -> str:
     what = "light on surfaces" if transport.way == "surface light" else "a matrix"
     parts = [f"{what} predicted {count(summary.renders.get('products'), 'picture')}"]
     if transport.error is not None:
-        levels, logits = map(_short, (transport.error.levels, transport.error.logits))
         parts.append(
-            f"at the last comparison with a traced one it was off by {levels} of 255 levels of the picture's change "
-            f"(root mean square) and {logits} of the objective"
+            "at the last comparison with a traced one it was off by "
+            f"{_short(transport.error.levels)} of 255 levels of the picture's change (root mean square) and "
+            f"{_short(transport.error.logits)} of the objective"
         )
     if transport.renewed:
         parts.append(f"made anew {count(transport.renewed, 'time')}")
     if transport.seconds is not None:
-        parts.append(f"it and the comparisons took {seconds_text(transport.seconds)}")
+        parts.append(f"it and the comparisons took {words.seconds_text(transport.seconds)}")
     return "; ".join([*parts, *filter(None, [transport.reason])])
-
-
-def plan_text(summary: AttackSummary) -> str:
-    """Return what a gradient plan comes to."""
-    plan = summary.gradient_plan
-    spp = "" if plan.spp is None else f", {count(plan.spp, 'sample')} a pixel"
-    renders = count(plan.renders_per_gradient, "render")
-    return f"Gradient plan: {count(len(plan.groups), 'parameter')}, {renders} a gradient beside the picture itself{spp}"
-
-
-def plan_rows(summary: AttackSummary) -> list[list[str]]:
-    """Return a row for each parameter of the gradient plan."""
-    rows = []
-    for group in summary.gradient_plan.groups:
-        unit = "" if group.unit in ("", "1") else f" {group.unit}"
-        wide = f"{group.step:.3g} of its range" if group.step_in_unit is None else f"{group.step_in_unit:.3g}{unit}"
-        step = f"{wide}: {group.step_reason}" if group.step_reason else ""
-        rows.append([group.name, str(group.size), group.estimator, group.reason, step])
-    return rows

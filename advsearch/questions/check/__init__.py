@@ -19,6 +19,6 @@ from advsearch.questions.check.result import shown as shown
 )
 def check(asked: Asked[CheckConfig]) -> CheckResult:
     """Compare every gradient of a scene with differences, and plan a search over it (docs/gradients.md)."""
-    from advsearch.questions.check.carry_out import check_from_config  # imports torch
+    from advsearch.questions.check.carry_out import checked  # imports torch
 
-    return check_from_config(asked.config, progress=asked.progress, resumed=asked.resumed)
+    return checked(asked)

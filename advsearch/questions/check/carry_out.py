@@ -6,9 +6,8 @@ import math
 import statistics
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,11 +20,11 @@ from advsearch.engine import planning
 from advsearch.engine.gradients import FACTORS, Loss, attempts, derivatives, inside, smooth_loss
 from advsearch.engine.naming import settings_alone
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Results, kept_rows
-from advsearch.progress import NullProgress, Progress
+from advsearch.engine.record import Results, taken_rows
+from advsearch.progress import Progress
+from advsearch.question import Asked
 from advsearch.questions.attack.carry_out import LOADING, problem_from_config
 from advsearch.questions.check.result import CheckConfig, CheckedRow, CheckResult, GainRow, SearchPlan, TexelRow
-from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Measured, PathLength
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
@@ -41,45 +40,38 @@ REFERENCE_SPP, SEEDS = 64, (6, 16)
 """Samples a pixel of a reference render, and how many seeds it gets: until its noise is small."""
 FEW_SEEDS = (3, 6)  # seeds of a reference of the model's loss, whose renders have more samples
 HINT = "`resolution` or fewer controls shorten it, `seconds` ends it"
-
 Finding = CheckedRow | SearchPlan | PathLength | GainRow | TexelRow
 FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
 
 
-def check_from_config(
-    config: CheckConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> CheckResult:
-    """Do what a configuration describes, or go on with it, and keep it in a run directory. What is measured is stored
-    at once, so that a check that was stopped goes on where it was and ends with the same rows; only times differ."""
-    progress, begun = progress or NullProgress(), time.perf_counter()
-    progress.stage(LOADING)
-    parts = parts_of(config)
-    with RunDirectory.of(config, resumed) as run:
-        results, measured = Results(run, config.seconds), 0
+def checked(asked: Asked[CheckConfig]) -> CheckResult:
+    """Do what is asked, or go on with it. What is measured is stored at once, so that a check that was stopped goes on
+    where it was and ends with the same rows; only times differ."""
+    asked.progress.stage(LOADING)
+    parts, measured = parts_of(asked.config), 0
+    results, configs = Results(asked.run, asked.config.seconds), [part.config for part in parts]
 
-        def findings() -> Iterator[Finding]:
-            nonlocal measured
-            for part in parts:
-                yield from _findings_of(part, len(parts), results, progress)
-                measured += 1
+    def findings() -> Iterator[Finding]:
+        nonlocal measured
+        for part in parts:
+            yield from _findings_of(part, len(parts), results, asked.progress)
+            measured += 1
 
-        def result(taken: Sequence[Finding], ending: str) -> CheckResult:
-            configs = [part.config for part in parts]
+    def result(taken: list[Finding]) -> CheckResult:
+        def those(kind: type[Any]) -> list[Any]:
+            return [row for row in taken if isinstance(row, kind)]
 
-            def those(kind: type[Any]) -> list[Any]:
-                return [row for row in taken if isinstance(row, kind)]
+        return asked.result(
+            CheckResult,
+            object=",".join(dict.fromkeys(config.object for config in configs)),
+            environment=",".join(dict.fromkeys(config.lit_by for config in configs)),
+            controls=list(dict.fromkeys(name for config in configs for name in config.controls)),
+            measured=measured, planned=len(parts), rows=those(CheckedRow),
+            plan=next(iter(those(SearchPlan)), None), bounces=next(iter(those(PathLength)), None),
+            gains=those(GainRow), texels=those(TexelRow),
+        )  # fmt: skip
 
-            return CheckResult(
-                run=str(run.path), object=",".join(dict.fromkeys(config.object for config in configs)),
-                environment=",".join(dict.fromkeys(config.lit_by for config in configs)),
-                controls=list(dict.fromkeys(name for config in configs for name in config.controls)),
-                ending=ending, measured=measured, planned=len(parts), rows=those(CheckedRow),
-                plan=next(iter(those(SearchPlan)), None), bounces=next(iter(those(PathLength)), None),
-                gains=those(GainRow), texels=those(TexelRow), seconds={"total": time.perf_counter() - begun},
-                seed=config.seed, command_line=config.command_line(),
-            )  # fmt: skip
-
-        return kept_rows(run, results, findings(), result)
+    return taken_rows(asked, results, findings(), result)
 
 
 @dataclass(frozen=True)
@@ -114,7 +106,6 @@ def parts_of(config: CheckConfig) -> list[CheckedPart]:
 
 
 def _findings_of(part: CheckedPart, parts: int, results: Results, progress: Progress) -> Iterator[Finding]:
-    """What is found of a part, as it comes; of one that was measured before, without loading anything."""
     stored = results.stored(part.key)
     if stored is not None:
         yield from FINDINGS.validate_python(stored)
@@ -134,7 +125,6 @@ def _findings_of(part: CheckedPart, parts: int, results: Results, progress: Prog
 
 
 def _linear(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[CheckedRow]:
-    """Every estimator of each parameter, by a smooth linear loss of the raw picture."""
     config = part.config
     problem, _ = problem_from_config(config, denoise="none")
     problem.renderer.formation = replace(problem.renderer.formation, transfer="linear")
@@ -147,7 +137,6 @@ def _linear(part: CheckedPart, title: str, results: Results, progress: Progress)
 
 
 def _model(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[Finding]:
-    """What a search by the model's loss does: its plan, how good that is, and what it leaves out."""
     config = part.config
     problem, _ = problem_from_config(config)
     renderer, u = problem.renderer, inside(problem.renderer)
@@ -194,7 +183,6 @@ def _derivatives(
 
 
 def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, progress: Progress) -> Iterator[Finding]:
-    """How a search gets its derivatives, and what it leaves out with what that saves."""
     config, renderer, u = part.config, problem.renderer, inside(problem.renderer)
     summary, used = problem.plan_summary(renderer.plan), {group.estimator for group in renderer.plan.groups}
     not_computed = {

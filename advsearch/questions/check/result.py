@@ -18,6 +18,7 @@ from advsearch.runs.results import (
     PathLength,
     PlannedGradient,
     RunResult,
+    optional,
 )
 from advsearch.settings import Clash, setting, setting_as_in
 
@@ -103,14 +104,13 @@ class CheckResult(InNotebook, RunResult):
     measured: int = Field(description="parts (a scene with a control and a loss) that are done")
     planned: int = Field(description="all parts")
     rows: list[CheckedRow]
-    plan: SearchPlan | None = Field(default=None, description="absent of `loss=linear` and of `all`")
-    bounces: PathLength | None = Field(default=None, description="how long the light paths of a long search are")
+    plan: SearchPlan | None = optional("absent of `loss=linear` and of `all`")
+    bounces: PathLength | None = optional("how long the light paths of a long search are")
     gains: list[GainRow] = Field(default=[], description="what is left out, and what that saves")
     texels: list[TexelRow] = Field(default=[], description="of the searched textures")
 
     @property
     def falls_short(self) -> bool:
-        """Whether a parameter has no good gradient by any estimator."""
         return bool(short_names(self.rows))
 
     @property
@@ -149,11 +149,20 @@ WHOLE: Mapping[str, Column] = {
     "seconds": "{0.seconds:.2f}",
     "status": "{0.status}",
 }
+
+
+def _step(group: GroupDerivative) -> str:
+    if not group.step_reason:
+        return ""
+    unit = "" if group.unit == "1" else f" {group.unit}"
+    return f"{group.step:.3g}" + ("" if group.step_in_unit is None else f" ({group.step_in_unit:.3g}{unit})")
+
+
 GROUPS: Mapping[str, Column] = {
     "parameter": "{0.name}",
     "numbers": "{0.size}",
     "estimator": "{0.estimator}",
-    "step": lambda group: _step(group),
+    "step": _step,
 }
 GAINS: Mapping[str, Column] = {
     "left out": "{0.what}",
@@ -169,16 +178,30 @@ LOSSES = {
 
 
 def shown(result: CheckResult) -> ShownResult:
-    """Return what fell short, the plan of a search, what it leaves out, and a table for each loss."""
     rows, left, plan, sentences = result.rows, result.planned - result.measured, result.plan, []
     if left:
-        why = "The time was up" if result.ending == OUT_OF_TIME else "Stopped"
-        sentences.append(f"{why} after {result.measured} of {result.planned} parts (a scene, its controls and a loss).")
+        stopped = "The time was up" if result.ending == OUT_OF_TIME else "Stopped"
+        sentences.append(
+            f"{stopped} after {result.measured} of {result.planned} parts (a scene, its controls and a loss)."
+        )
     if short := short_names(rows):
         sentences.append(f"No estimator is good enough for {', '.join(short)}.")
     elif rows:
         sentences.append(f"Every parameter {'so far ' if left else ''}has a good gradient.")
-    groups = plan.groups if plan else []
+    groups, left_out = (plan.groups, [*plan.left_out]) if plan else ([], [])
+    reasons: dict[tuple[str, str], list[str]] = {}  # each once, with its parameters
+    for group in groups:
+        reasons.setdefault((group.estimator, group.reason), []).append(group.name)
+    for group in groups:
+        if group.step_reason:
+            reasons.setdefault(("step", group.step_reason), []).append(group.name)
+    if bounces := result.bounces:
+        longest = f"at most {bounces.depth} segments of {bounces.full}: {bounces.reason}"
+        left_out.append(f"light paths of a long search: {longest}")
+    for texels in result.texels:
+        seen = f"{texels.seen} are seen in {texels.pixels} pixels"
+        left_out.append(f"texels of {texels.control}: {seen}, which resolve {texels.enough} of {texels.side} a side")
+    why = [f"{what} of {', '.join(names)}: {reason}" for (what, reason), names in reasons.items()]
     whole = [row for row in rows if row.quantity == "gradient"]
     facts = {} if plan is None else {"renders a gradient": str(plan.renders_per_gradient), "samples": str(plan.spp)}
     return ShownResult(
@@ -192,8 +215,8 @@ def shown(result: CheckResult) -> ShownResult:
                 for name, title in LOSSES.items()
             ),
             ResultPart.table(whole, WHOLE, title="The model's loss, cosine with the converged gradient"),
-            ResultPart.table(groups, GROUPS, title="How a search gets its derivatives", text=_reasons(groups)),
-            ResultPart("Left out", _left_out(result)),
+            ResultPart.table(groups, GROUPS, title="How a search gets its derivatives", text=why),
+            ResultPart("Left out", left_out),
             ResultPart.table(result.gains, GAINS, title="What that saves"),
         ],
         facts,
@@ -215,36 +238,6 @@ def short_names(rows: Sequence[CheckedRow]) -> list[str]:
             best[key] = row
     short = [row for row in best.values() if row.status in ("biased", "noisy")]
     return list(dict.fromkeys(f"{row.name} ({row.status})" for row in short))
-
-
-def _step(group: GroupDerivative) -> str:
-    """The step of a difference in u, and in the parameter's unit where it has one."""
-    if not group.step_reason:
-        return ""
-    unit = "" if group.unit == "1" else f" {group.unit}"
-    return f"{group.step:.3g}" + ("" if group.step_in_unit is None else f" ({group.step_in_unit:.3g}{unit})")
-
-
-def _reasons(groups: Sequence[GroupDerivative]) -> list[str]:
-    """Why the estimators and the steps are what they are, each reason once with its parameters."""
-    reasons: dict[tuple[str, str], list[str]] = {}
-    for group in groups:
-        reasons.setdefault((group.estimator, group.reason), []).append(group.name)
-    for group in groups:
-        if group.step_reason:
-            reasons.setdefault(("step", group.step_reason), []).append(group.name)
-    return [f"{what} of {', '.join(names)}: {reason}" for (what, reason), names in reasons.items()]
-
-
-def _left_out(result: CheckResult) -> list[str]:
-    sentences = list(result.plan.left_out) if result.plan else []
-    if result.bounces is not None:
-        depth, full = result.bounces.depth, result.bounces.full
-        sentences.append(f"light paths of a long search: at most {depth} segments of {full}: {result.bounces.reason}")
-    for texels in result.texels:
-        seen = f"{texels.seen} are seen in {texels.pixels} pixels"
-        sentences.append(f"texels of {texels.control}: {seen}, which resolve {texels.enough} of {texels.side} a side")
-    return sentences
 
 
 def _difference(share: float) -> str:

@@ -15,6 +15,6 @@ from advsearch.questions.precision.result import shown as shown
 )
 def precision(asked: Asked[PrecisionConfig]) -> PrecisionResult:
     """Measure error against run time of a scene and its gradients (docs/precision.md)."""
-    from advsearch.questions.precision.carry_out import precision_from_config  # imports torch
+    from advsearch.questions.precision.carry_out import measured  # imports torch
 
-    return precision_from_config(asked.config, progress=asked.progress, resumed=asked.resumed)
+    return measured(asked)

@@ -38,7 +38,6 @@ class TimeBudget:
         return max(0.0, self._end - self.clock())
 
     def share(self, part: float) -> TimeBudget:
-        """Return a budget of a part, in [0, 1], of what is left."""
         return TimeBudget(part * self.left, self.clock)
 
 
@@ -127,8 +126,7 @@ def part_samples(
     return max((count for count in counts if parts * count * rate <= seconds), default=counts[0])
 
 
-def timed(take: Callable[[], Tensor]) -> tuple[Tensor, dict[str, float]]:
-    """Return what is taken, with the processor time of all threads, and the time by the clock."""
+def timed(take: Callable[[], Part]) -> tuple[Part, dict[str, float]]:
     processor, wall = time.process_time(), time.perf_counter()
     taken = take()
     return taken, {"seconds": time.process_time() - processor, "wall_seconds": time.perf_counter() - wall}
@@ -154,18 +152,14 @@ class PictureBench:
         self, renderer: Renderer, u: Tensor, margin: Callable[[Tensor], float], samplers: Sequence[str]
     ) -> None:
         self._u, self._margin, self._space, self._formation = u, margin, renderer.space, renderer.formation
-        denoised = [sampler + OIDN for sampler in ("independent", REFERENCE_SAMPLER) if sampler in samplers]
-        self._lines = [*samplers, *denoised]
+        self._lines = [*samplers, *(name + OIDN for name in ("independent", REFERENCE_SAMPLER) if name in samplers)]
         self._references: dict[tuple[str, str], ReferenceValue] = {}
         scenes = {name: renderer.scene.like(sampler=name) for name in {*samplers, REFERENCE_SAMPLER}}
         self._renderers = {
             line: renderer.like(scenes[line.removesuffix(OIDN)], denoiser=denoiser_of(line))
             for line in {*self._lines, REFERENCE_SAMPLER, REFERENCE_SAMPLER + OIDN}
         }
-
-    @property
-    def settings(self) -> list[SampleSetting]:
-        return [
+        self.settings = [
             SampleSetting("picture", line, count, count * (1.0 if line in FIRST else LATER), family=denoiser_of(line))
             for line in self._lines
             for count in COUNTS.get(line, (4, 16, 64, 256))
@@ -173,18 +167,17 @@ class PictureBench:
 
     def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> list[PrecisionReference]:
         """Render the references, one for each family, in shares of a budget."""
+
+        def shown(mean: Array) -> Tensor:
+            size = (*self._formation.resolution, 3)
+            return self._picture(torch.from_numpy(mean).to(torch.float32).reshape(size))
+
         families, rows = list(dict.fromkeys(map(denoiser_of, self._lines))), []
         for number, family in enumerate(families):
-            share = budget.share(1.0 / (len(families) - number))
-            name = REFERENCE_SAMPLER + OIDN * (family == "oidn")
+            share, name = budget.share(1.0 / (len(families) - number)), REFERENCE_SAMPLER + OIDN * (family == "oidn")
             take = partial(self._radiance, name)
             spp = part_samples(partial(take, 0), share.left)
             parts = [flat(radiance) for radiance in gather(partial(take, spp=spp), share, on_done, seed)]
-
-            def shown(mean: Array) -> Tensor:
-                size = (*self._formation.resolution, 3)
-                return self._picture(torch.from_numpy(mean).to(torch.float32).reshape(size))
-
             picture = reference_of(parts, lambda mean: flat(shown(mean)))
             margin = reference_of(parts, lambda mean: np.array([self._margin(shown(mean))]))
             self._references["margin", family] = margin
@@ -214,7 +207,6 @@ class PictureBench:
 
 
 def denoiser_of(line: str) -> str:
-    """Return the denoiser of a line of the picture; lines are recommended among those with the same."""
     return "oidn" if line.endswith(OIDN) else "none"
 
 
@@ -234,15 +226,10 @@ class GradientPart:
     estimators: tuple[str, ...]
 
     @property
-    def names(self) -> set[str]:
-        return {group.name for group in self.groups}
-
-    @property
     def size(self) -> int:
         return sum(group.size for group in self.groups)
 
     def of(self, gradient: Tensor) -> Array:
-        """Return the part's entries (n,) of a whole gradient (d,)."""
         return flat(torch.cat([gradient[group.coordinates] for group in self.groups]))
 
 
@@ -275,22 +262,21 @@ class GradientBench:
         adjoints = [name for name in part.estimators if name in BY_ADJOINT]
         self._by = "differences" if part.size <= BY_COORDINATE else (*adjoints, *part.estimators)[0]
         self.reference: ReferenceValue | None = None
-
-    @property
-    def settings(self) -> list[SampleSetting]:
-        settings = []
-        for name in self.part.estimators:
-            renders = sum(replace(group, estimator=name).renders for group in self.part.groups)
-            cost = 1.0 + ADJOINT_COST.get(name, renders)
-            settings += [
-                SampleSetting("gradient", name, count, count * cost, self.part.name) for count in COUNTS["independent"]
-            ]
-        return settings
+        self.settings = list[SampleSetting]()
+        for name in part.estimators:
+            cost = 1.0 + ADJOINT_COST.get(name, sum(replace(group, estimator=name).renders for group in part.groups))
+            for count in COUNTS["independent"]:
+                self.settings.append(SampleSetting("gradient", name, count, count * cost, part.name))
 
     def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> list[PrecisionReference]:
-        """Find the reference."""
         if self.part.size <= BY_COORDINATE:
-            along = [_coordinate(self._u, group, number) for group in self.part.groups for number in range(group.size)]
+            along = []
+            for group in self.part.groups:
+                for place in range(group.begin, group.begin + group.size):
+                    direction = torch.zeros_like(self._u)
+                    direction[place] = 1.0
+                    alone, name = replace(group, size=1, begin=place), f"{group.name}.{place - group.begin}"
+                    along.append(Probe(alone, name, direction, group.step))
 
             def both(noise: int, spp: int) -> Array:
                 """Of each coordinate the derivative, extrapolated to a step of zero, and how far two steps differ."""
@@ -304,10 +290,7 @@ class GradientBench:
             bias = float(np.linalg.norm(np.mean([apart for _, apart in parts], axis=0))) / 4.0
             self.reference = reference_of([values for values, _ in parts], bias=bias)
         else:
-
-            def taken(noise: int, spp: int) -> Array:
-                return self.part.of(self._taken(self._exact, self._by, noise, spp))
-
+            taken = partial(self._taken, self._exact, self._by)
             spp = part_samples(partial(taken, 0), budget.left)
             self.reference = reference_of(gather(partial(taken, spp=spp), budget, on_done, seed))
         return [_row("gradient", self._by, self.reference, spp, self.part.name)]
@@ -319,14 +302,14 @@ class GradientBench:
         """Take one gradient; return how it compares, and its times, the picture itself included."""
         assert self.reference is not None
         gradient, times = timed(partial(self._taken, self._renderer, setting.estimator, seed, setting.spp))
-        return {"gradient": {**self.reference.beside(self.part.of(gradient)), **times}}
+        return {"gradient": {**self.reference.beside(gradient), **times}}
 
     def bias(self, seed: int) -> str | None:
         """Check a reference by an adjoint against differences along one direction; a sentence if it is biased."""
         if self._by == "differences" or self.reference is None:
             return None
         exact = self._exact
-        exact.plan = only(exact.plan, self.part.names, self._by)
+        exact.plan = only(exact.plan, {group.name for group in self.part.groups}, self._by)
         probe = probes(exact, self._loss, self._u, seed, 64)[0]
         against = reference(exact, self._loss, self._u, probe, seed=seed, spp=64, repeats=(2, 4))
         own = float(self.reference.value @ self.part.of(probe.direction))
@@ -338,14 +321,9 @@ class GradientBench:
             f"differences {against.value:.3g} +- {against.noise:.1g}: its errors leave out that bias"
         )
 
-    def _taken(self, renderer: Renderer, estimator: str, seed: int, spp: int) -> Tensor:
-        return estimated(renderer, self._loss, self._u, estimator, self.part.names, seed, spp)
-
-
-def _coordinate(u: Tensor, group: Group, number: int) -> Probe:
-    direction = torch.zeros_like(u)
-    direction[group.begin + number] = 1.0
-    return Probe(replace(group, size=1, begin=group.begin + number), f"{group.name}.{number}", direction, group.step)
+    def _taken(self, renderer: Renderer, estimator: str, seed: int, spp: int) -> Array:
+        names = {group.name for group in self.part.groups}
+        return self.part.of(estimated(renderer, self._loss, self._u, estimator, names, seed, spp))
 
 
 def _row(quantity: str, name: str, value: ReferenceValue, spp: int, control: str = "") -> PrecisionReference:

@@ -17,21 +17,20 @@ from advsearch import seeds, threads
 from advsearch.cluster.worker import processor
 from advsearch.engine.gradients import Loss, inside, smooth_loss
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Results, kept_rows
+from advsearch.engine.record import Results, taken_rows
 from advsearch.errors import InputError
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import Progress
+from advsearch.question import Asked
 from advsearch.questions.attack.carry_out import LOADING, problem_from_config
 from advsearch.questions.precision import benches
 from advsearch.questions.precision import result as room
 from advsearch.questions.precision.benches import OIDN, GradientBench, GradientPart, PictureBench, TimeBudget
 from advsearch.questions.precision.result import PrecisionConfig, PrecisionPoint, PrecisionResult, Recommended, Sitting
 from advsearch.questions.precision.rule import RoundUp, confirmed, fit_line, point_of, reaching, warning_of
-from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results import Formation
 from advsearch.scene.formation import next_count
 from advsearch.settings import split_names
-from advsearch.viewer.pages import keep_result
 
 SHARES = {"image": 0.6, "gradient": 0.4}  # of the time, by quantity; what one doesn't use is the others'
 REFERENCE_SHARE = 0.35  # of the time of a quantity, for its reference
@@ -40,59 +39,53 @@ CONFIRM_SHARE, CONFIRM_LEAST, CONFIRM_MOST = 0.4, 4, 64
 count, and at most."""
 
 
-def precision_from_config(
-    config: PrecisionConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> PrecisionResult:
+def measured(asked: Asked[PrecisionConfig]) -> PrecisionResult:
     """Measure error against run time and write figures and numbers.
 
     The picture and the gradient of each control are measured one after the other, each in one sitting, so that their
     times are beside each other; what is done is kept at once, and a run that was stopped goes on with the next, in the
     seconds that are left.
     """
-    progress, begun = progress or NullProgress(), time.perf_counter()
-    with RunDirectory.of(config, resumed) as run:
-        progress.stage(LOADING, hint=f"then {config.seconds:g} seconds of measurements; `seconds` sets them")
-        problem, remarks = problem_from_config(config)
-        for remark in remarks:
-            progress.message(remark)
-        job = Measurement(config, problem, progress)
-        setup, results = time.perf_counter() - begun, Results(run)
+    config, begun = asked.config, time.perf_counter()
+    asked.progress.stage(LOADING, hint=f"then {config.seconds:g} seconds of measurements; `seconds` sets them")
+    run, (problem, remarks) = asked.run, problem_from_config(config)
+    for remark in remarks:
+        asked.progress.message(remark)
+    job, results = Measurement(config, problem, asked.progress), Results(run)
+    setup = time.perf_counter() - begun
 
-        def sittings() -> Iterator[Sitting]:
-            left, shares = config.seconds, [share for _, share, _ in job.sittings]
-            for number, (name, share, measure) in enumerate(job.sittings):
-                budget = TimeBudget(left * share / math.fsum(shares[number:]))
-                sitting = results.row(name, Sitting, partial(measure, budget))
-                left = max(0.0, left - sitting.took)
-                yield sitting
+    def sittings() -> Iterator[Sitting]:
+        left, shares = config.seconds, [share for _, share, _ in job.sittings]
+        for number, (name, share, measure) in enumerate(job.sittings):
+            budget = TimeBudget(left * share / math.fsum(shares[number:]))
+            sitting = results.row(name, Sitting, partial(measure, budget))
+            left = max(0.0, left - sitting.took)
+            yield sitting
 
-        def result(taken: Sequence[Sitting], ending: str) -> PrecisionResult:
-            points = [point for sitting in taken for point in sitting.points]
-            warnings = [warning for sitting in taken for warning in sitting.warnings]
-            slopes = []
-            for line in lines_of(points).values():
-                if (slope := fit_line(line, job.or_steeper(line[0]))) is not None:
-                    slopes.append(slope)
-                    warnings += filter(None, [warning_of(slope, line)])
-            again = [point for sitting in taken for point in sitting.again]
-            recommendations = recommended(points, again, config.error, job.round_up, job.or_steeper)
-            return PrecisionResult(
-                run=str(run.path), object=config.object, model=problem.model.name, environment=problem.environment,
-                controls=list(config.controls), ending=ending, depth=problem.renderer.scene.max_depth, loss=config.loss,
-                image_formation=Formation.of(problem.renderer.formation), spp=problem.spp, machine=timing_machine(),
-                goal=config.error, points=points, slopes=slopes, recommendations=recommendations, figures=[],
-                references=[reference for sitting in taken for reference in sitting.references],
-                warnings=[*warnings, *room.cautions(points)],
-                left_out=[row for sitting in taken for row in sitting.left_out],
-                seconds={"budget": config.seconds, "setup": setup, "total": time.perf_counter() - begun},
-                seed=config.seed, command_line=config.command_line(),
-            )  # fmt: skip
+    def result(sittings: list[Sitting]) -> PrecisionResult:
+        points, again, references, left_out, warnings = (
+            [row for sitting in sittings for row in getattr(sitting, name)]
+            for name in ("points", "again", "references", "left_out", "warnings")
+        )
+        slopes = []
+        for line in lines_of(points).values():
+            if (slope := fit_line(line, job.or_steeper(line[0]))) is not None:
+                slopes.append(slope)
+                warnings += filter(None, [warning_of(slope, line)])
+        return asked.result(
+            PrecisionResult, model=problem.model.name, environment=problem.environment,
+            depth=problem.renderer.scene.max_depth, loss=config.loss, spp=problem.spp, goal=config.error,
+            image_formation=Formation.of(problem.renderer.formation), machine=timing_machine(), points=points,
+            slopes=slopes, references=references, left_out=left_out, warnings=[*warnings, *room.cautions(points)],
+            recommendations=recommended(points, again, config.error, job.round_up, job.or_steeper), figures=[],
+            seconds={"budget": config.seconds, "setup": setup},
+        )  # fmt: skip
 
-        found = kept_rows(run, results, sittings(), result)
-        (run.path / "images").mkdir(exist_ok=True)
-        figures = room.precision_figures(found)
-        written = [write_bytes(run.path / "images" / f"precision.{kind}", data) for kind, data in figures.items()]
-        return keep_result(run, found.model_copy(update={"figures": [str(path) for path in written]}))
+    taken = taken_rows(asked, results, sittings(), result)
+    (run.path / "images").mkdir(exist_ok=True)
+    figures = room.precision_figures(taken)
+    written = [write_bytes(run.path / "images" / f"precision.{kind}", data) for kind, data in figures.items()]
+    return taken.model_copy(update={"figures": [str(path) for path in written]})
 
 
 class Measurement:
@@ -114,9 +107,9 @@ class Measurement:
         self.sittings: list[tuple[str, float, Callable[[TimeBudget], Sitting]]] = []
         if "image" in wanted:
             self.sittings.append(("image", SHARES["image"], self._pictures))
-        if "gradient" in wanted:
+        for part in parts if "gradient" in wanted else ():
             share = SHARES["gradient"] / len(parts)
-            self.sittings += [(f"gradient of {part.name}", share, partial(self._gradients, part)) for part in parts]
+            self.sittings.append((f"gradient of {part.name}", share, partial(self._gradients, part)))
 
     def round_up(self, point: PrecisionPoint, samples: float) -> int:
         """Return the next number of samples that a setting takes. A line of the picture is named after its sampler; one
@@ -164,7 +157,6 @@ class Measurement:
         return sitting.model_copy(update={"again": again, "warnings": warnings, "took": took})
 
     def _sitting(self, title: str, bench: PictureBench | GradientBench, budget: TimeBudget) -> Sitting:
-        """Find references, and measure every setting in rounds."""
         begun, share = time.perf_counter(), budget.share(REFERENCE_SHARE)
         references = bench.refer(share, self._seed, self._stage(f"{title}: references", share))
         tick = self._stage(f"{title}: measuring every setting in rounds", budget)
@@ -179,12 +171,11 @@ class Measurement:
                 points.append(point_of(named, [each[quantity] for each in samples], bench.floor(setting, quantity)))
         lines: dict[str, list[str]] = {}
         for setting in measured.left_out:
-            lines.setdefault(setting.estimator, []).append(str(setting.spp))
-        left_out = [f"{title} by {name}: {', '.join(counts)} samples" for name, counts in lines.items()]
+            lines.setdefault(f"{title} by {setting.estimator}", []).append(str(setting.spp))
+        left_out = [f"{line}: {', '.join(counts)} samples" for line, counts in lines.items()]
         return Sitting(points=points, references=references, left_out=left_out, took=time.perf_counter() - begun)
 
     def _stage(self, name: str, budget: TimeBudget) -> Callable[..., None]:
-        """Begin a stage that ends with a budget of seconds, and return what tells how many have passed."""
         total, done = max(1, math.ceil(budget.left)), 0
         self._progress.stage(name, total, hint="counted in seconds; `seconds` sets them", at_most=True)
 
@@ -205,12 +196,9 @@ def lines_of(points: Sequence[PrecisionPoint]) -> dict[tuple[str, ...], list[Pre
 
 
 def recommended(
-    points: Sequence[PrecisionPoint],
-    again: Sequence[PrecisionPoint],
-    goal: float,
-    round_up: RoundUp,
+    points: Sequence[PrecisionPoint], again: Sequence[PrecisionPoint], goal: float, round_up: RoundUp,
     or_steeper: Callable[[PrecisionPoint], bool | None] = lambda point: None,
-) -> list[Recommended]:
+) -> list[Recommended]:  # fmt: skip
     """Return, for each thing that can be asked for, the setting that reaches a goal soonest, if any is known to; one
     that was measured `again` by what that said."""
     asked: dict[tuple[str, ...], list[Recommended]] = {}
@@ -230,7 +218,6 @@ def recommended(
 
 
 def timing_machine(cpu_info: Path = Path("/proc/cpuinfo")) -> room.Machine:
-    """Return what a time has to be read with: processor (by Linux), cores, and the threads in use."""
     used = {"torch": torch.get_num_threads()}
     if "drjit" in sys.modules:
         used["render"] = int(sys.modules["drjit"].thread_count())

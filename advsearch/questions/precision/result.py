@@ -11,7 +11,7 @@ from pydantic import Field, field_validator
 from advsearch.config import DerivativeConfig, SceneConfig
 from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn
 from advsearch.report.shown import Column, ResultPart, ShownResult
-from advsearch.runs.results import Fields, Formation, Interval, JsonFloat, Measured, RunResult
+from advsearch.runs.results import Fields, Formation, Interval, JsonFloat, Measured, RunResult, optional
 from advsearch.settings import Clash, check_once, setting, setting_as_in, split_names
 
 QUANTITIES = ("image", "gradient")
@@ -76,7 +76,7 @@ class PrecisionPoint(Measured):
         description="what it is recommended among: `raw`, `oidn`, `depth` or `predicted`; absent of gradients",
     )
     heavy_tailed: bool = Field(default=False, description="a few pixels hold the error, so that it has no interval")
-    wall_seconds: JsonFloat | None = Field(default=None, description="by the clock; `seconds` are processor time")
+    wall_seconds: JsonFloat | None = optional("by the clock; `seconds` are processor time")
 
     @property
     def known(self) -> bool:
@@ -122,12 +122,12 @@ class Recommended(Fields):
     control: str
     family: str = ""
     goal: float | None = None
-    estimator: str | None = Field(default=None, description="null where nothing that was measured reaches it")
+    estimator: str | None = optional("null where nothing that was measured reaches it")
     spp: int | None = None
     seconds: JsonFloat | None = None
     error: JsonFloat | None = None
-    basis: str | None = Field(default=None, description="measured, fitted, interpolated, extrapolated or confirmed")
-    repeats: int | None = Field(default=None, description="measurements that confirm it")
+    basis: str | None = optional("measured, fitted, interpolated, extrapolated or confirmed")
+    repeats: int | None = optional("measurements that confirm it")
 
 
 class Sitting(Fields):
@@ -207,7 +207,6 @@ REFERENCES: Mapping[str, Column] = {
 
 
 def shown(result: PrecisionResult) -> ShownResult:
-    """Return what was measured, what follows from it, and what was not measured."""
     machine = result.machine
     threads = " and ".join(f"{count} of {name}" for name, count in machine.threads.items())
     stopped = "It was stopped: only a part was measured. " if result.goes_on else ""
@@ -231,7 +230,6 @@ def shown(result: PrecisionResult) -> ShownResult:
 
 
 def headline(result: PrecisionResult) -> str:
-    """Return the result in one line: what an error takes, of the first quantity that reaches it."""
     found = next((row for row in result.recommendations if row.estimator), None)
     if found is None:
         return "Nothing that was measured is known to reach the error: give it more `seconds` or a larger `error`."
@@ -269,7 +267,6 @@ def cautions(points: Sequence[PrecisionPoint]) -> list[str]:
 
 
 def _errors(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
-    """A row for each setting of a quantity."""
     rows = [point for point in points if point.quantity == quantity]
     columns: dict[str, Column] = {"control": "{0.control}"} if quantity == "gradient" else {}
     columns |= {

@@ -49,7 +49,6 @@ class SampleSetting:
 
     @property
     def line(self) -> tuple[str, str, str]:
-        """What all settings of one line of a diagram share."""
         return self.quantity, self.control, self.estimator
 
 
@@ -197,7 +196,6 @@ def levels_off(points: Sequence[PrecisionPoint]) -> bool:
 
 
 def exactly(point: PrecisionPoint, samples: float) -> int:
-    """Round a number of samples up, where every number will do."""
     return math.ceil(samples - 1e-9)
 
 

@@ -112,7 +112,7 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
         yield same("sensor", name, change=partial(_sensed, full))
 
     def by_blender() -> Problem:
-        return replace(problem, renderer=renderer.rendered_by(cycles.radiance))
+        return replace(problem, renderer=renderer.like(source=cycles.radiance))
 
     denoise, missing = formation.denoiser != "none", ""
     try:

@@ -25,7 +25,6 @@ POSES, LARGEST_POSES = "poses.csv", 1 << 20  # the file that says where photogra
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
     parser.add_argument("runs", nargs="+", metavar="RUN", help="names or folders of runs; of a recipe, its parts")
     parser.add_argument("--evidence", action="store_true", help="claims with what a reader needs to judge them")
     parser.add_argument("--criterion", metavar="SHARE", type=float, help="share of right predictions that is asked for")
@@ -44,7 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the files."""
     # late, so that --help answers at once
     from advsearch.questions.report.evidence import collected, read_exposure
     from advsearch.questions.report.result import evidence_page, markdown
@@ -71,19 +69,14 @@ def run(args: argparse.Namespace) -> int:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"--out: cannot make the folder {folder}: {error.strerror}") from None
-    texts = (evidence_page(evidence, pictures), markdown(evidence), to_json(evidence) + "\n")
     for name, data in pictures.items():
         write_bytes(folder / name, data)
+    texts = (evidence_page(evidence, pictures), markdown(evidence), to_json(evidence) + "\n")
     for path, text in zip(names, texts, strict=True):
         write_text(path, text)
-    if args.json:
-        output.print_json(evidence)
-        return 0
-    for told in evidence.runs:
-        print("\n".join([told.run, *(f"  {claim.kind}: {claim.statement}" for claim in told.claims)]))
-    print("".join(f"\nNote: {text}" for text in evidence.warnings))
-    print("\n".join(map(str, names)))
-    return 0
+    lines = [text for run in evidence.runs for text in (run.run, *(f"  {c.kind}: {c.statement}" for c in run.claims))]
+    notes = "".join(f"\nNote: {text}" for text in evidence.warnings)
+    return output.say(args.json, evidence.to_dict(), "\n".join([*lines, notes, *map(str, names)]))
 
 
 def _take_in(folder: str, name: str) -> None:
@@ -134,7 +127,6 @@ def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
 
 
 def _is_at(value: object, text: str | None) -> bool:
-    """Whether a rendering has what a file says, to a thousandth."""
     if text is None or value is None or isinstance(value, str):
         return text is not None and value == text.strip()
     try:

@@ -6,14 +6,13 @@ import json
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-import advsearch.questions.report.evidence as engineering
 from advsearch import __version__, registry
 from advsearch.attacks import clopper_pearson
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
@@ -24,9 +23,9 @@ from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.explain.result import ExplainResult, rule_text
 from advsearch.questions.photographs.result import FOLDER, PHOTO, PhotoAgreement
 from advsearch.questions.report.result import CROSSWALK, CROSSWALK_HEADS, ConditionShare, Evidence, EvidenceRun
-from advsearch.questions.sweep.summary import AxisRow, AxisValue, SweepSummary
+from advsearch.questions.sweep.summary import AxisValue, SweepSummary
 from advsearch.report import wording
-from advsearch.report.shown import Claim, Extent, claim, nothing_claimed, share_text
+from advsearch.report.shown import Claim, claim, counted, nothing_claimed, share_text
 from advsearch.report.wording import interval_text, number_text, percent
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, typed_name
 from advsearch.runs.results import RUNNING, Interval, Result, VariedValue
@@ -54,52 +53,39 @@ DOMAIN = {
 Exposure = Mapping[str, Mapping[str, float]]  # how common the values of axes are: weights by axis and value
 
 
-def conditions_of(result: Result) -> list[ConditionShare]:
-    """Return the share of right predictions by each value of each axis of a sweep."""
-    rows = result.axes if isinstance(result, SweepSummary) else ()
-    return [
-        _condition(row, row.correct, row.configurations, row.interval)
-        for row in rows
-        if row.configurations and row.interval is not None
-    ]
-
-
-def photograph_conditions(result: Result, photographs: Iterable[Row]) -> list[ConditionShare]:
-    """Return the share of photographs that agree with the rendering that they were aligned with, by each value of each
-    axis of a sweep: right in both or wrong in both."""
-    rows, conditions = list(photographs), list[ConditionShare]()
-    for at in result.axes if isinstance(result, SweepSummary) else ():
-        agree = []
-        for row in rows:
-            kept: Any = row.payload
-            if at.axis in row.values and _has(row.values[at.axis]["value"], at.value):
-                agree.append(bool(row.correct) == bool(kept["photo"]["right"]))
-        if agree:
-            conditions.append(_condition(at, sum(agree), len(agree), clopper_pearson(sum(agree), len(agree))))
+def conditions_of(result: Result, photographs: Sequence[Row] | None = None) -> list[ConditionShare]:
+    """Return the share of right predictions by each value of each axis of a sweep; or that of its photographs which
+    agree with the rendering that they were aligned with: right in both or wrong in both."""
+    conditions = []
+    for row in result.axes if isinstance(result, SweepSummary) else ():
+        right, total, interval = row.correct, row.configurations, row.interval
+        if photographs is not None:
+            agree = [
+                bool(photo.correct) == bool(cast(Any, photo.payload)["photo"]["right"])
+                for photo in photographs
+                if row.axis in photo.values and _has(photo.values[row.axis]["value"], row.value)
+            ]
+            right, total = sum(agree), len(agree)
+            interval = clopper_pearson(right, total) if total else None
+        if total and interval is not None:
+            value = " to ".join(map(number_text, row.value if isinstance(row.value, tuple) else (row.value,)))
+            unit = "" if row.unit == "1" else row.unit
+            conditions.append(
+                ConditionShare(
+                    condition=f"{row.axis} {value} {unit}".strip(), axis=row.axis, value=value, right=right,
+                    total=total, interval=interval,
+                )
+            )  # fmt: skip
     return conditions
 
 
-def _condition(row: AxisRow, right: int, total: int, interval: Interval) -> ConditionShare:
-    value, unit = _value(row.value), "" if row.unit == "1" else row.unit
-    name = f"{row.axis} {value} {unit}".strip()
-    return ConditionShare(condition=name, axis=row.axis, value=value, right=right, total=total, interval=interval)
-
-
 def _has(value: float | str, of: AxisValue) -> bool:
-    """Whether a value of a row is that of an axis, or lies in that part of its range."""
     if isinstance(value, str) or isinstance(of, str):
         return value == of
     return of[0] <= value <= of[1] if isinstance(of, tuple) else math.isclose(value, of)
 
 
-def _value(value: object) -> str:
-    if isinstance(value, tuple):
-        return f"{value[0]:.4g} to {value[1]:.4g}"
-    return number_text(value) if isinstance(value, float) else str(value)
-
-
 def triggering_conditions(result: Result) -> list[str]:
-    """Return the rules of `explain`, and whether fresh renders confirm each."""
     rules, lines = result.rules if isinstance(result, ExplainResult) else [], []
     for number, rule in enumerate(rules, start=1):
         state = "Counted on rows that did not choose it, not rendered"
@@ -175,23 +161,18 @@ def exposure_lines(result: Result, conditions: Sequence[ConditionShare], exposur
 
 def domain_of(result: Result, settings: Mapping[str, object], searched: Sequence[str]) -> dict[str, str]:
     """Return what an operational design domain consists of, in words: within what each part varied, or what it was."""
-    things = str(settings.get("things") or "")
+    things = [str(getattr(result, "object", "") or ""), str(settings.get("things") or "")]
     fixed = {
         "place": str(getattr(result, "environment", "") or settings.get("environment") or ""),
-        "road users and things": "; ".join(filter(None, [str(getattr(result, "object", "") or ""), things])),
+        "road users and things": "; ".join(filter(None, things)),
         "camera and picture": str(settings.get("camera") or ""),
     }
-    drives = getattr(result, "drives", None) or []
-    moving = [*getattr(result, "controls", ()), *getattr(result, "over", ())]
-    domain = {}
-
-    def beginning(lines: Sequence[str], names: Sequence[str]) -> list[str]:
-        return [line for line in lines if (word := re.match(r"\w+", line)) and word[0] in names]
-
+    moving, domain = [*getattr(result, "controls", ()), *getattr(result, "over", ())], {}
     for part, names in DOMAIN.items():
-        varied = beginning(searched, names) or beginning(moving, names)  # one of several that a sentence is about
-        if part == "ways and speeds":
-            varied += [f"{each.drives} drives of {each.seconds:g} s, {each.frames} frames each" for each in drives[:1]]
+        begins = re.compile(rf"({'|'.join(names)})\b")
+        varied = list(filter(begins.match, searched)) or list(filter(begins.match, moving))
+        for drive in (getattr(result, "drives", None) or [])[:1] if part == "ways and speeds" else ():
+            varied.append(f"{drive.drives} drives of {drive.seconds:g} s, {drive.frames} frames each")
         alone = f"not varied: {fixed[part]}" if fixed.get(part) else "not varied"
         domain[part] = "; ".join(varied) or alone
     if not domain["place"].startswith("not varied"):
@@ -200,25 +181,7 @@ def domain_of(result: Result, settings: Mapping[str, object], searched: Sequence
     return domain
 
 
-def not_shown(domain: Mapping[str, str], photographs: int, *, weighted: bool = False) -> list[str]:
-    """Return what a reader must not take from a run; `weighted` where shares are weighted by how common values are."""
-    still = [part for part, text in domain.items() if text.startswith("not varied")]
-    compared = f"Only {photographs} photographs were" if photographs else "No photograph was"
-    return [
-        f"{compared} compared with renderings: all else is about renderings.",
-        *([f"Nothing is said of other values of: {', '.join(still)}."] if still else []),
-        "How common the conditions are is what the weights say, of their axes alone."
-        if weighted
-        else "Nothing is said of how common the conditions are: no weights were given.",
-    ]
-
-
-def pictures_of(run: Path) -> list[Path]:
-    """Return the pictures of a run that say most of what it found."""
-    names = ("drive", "clean", "adversarial", "worst", "sweep")
-    files = [run / "images" / f"{name}.png" for name in names]
-    return [file for file in files if file.is_file() and not file.is_symlink()][:3]
-
+PICTURES = ("drive", "clean", "adversarial", "worst", "sweep")  # of a run that say most of what it found, best first
 
 RULES = (
     "Each claim is about the run's own model, object, environment, label and settings, and about nothing else.",
@@ -235,11 +198,9 @@ QUICK = "Made by a quick recipe: few and small pictures, to see what comes out; 
 
 
 def claims_of(result: Result) -> list[Claim]:
-    """Return what a run stands for; one that stands for nothing says so in a claim of that kind."""
     if result.goes_on:
-        told = f"; so far: {result.brief}" if result.brief else ""
         state = "is running" if getattr(result, "ending", "") == RUNNING else "is not finished"
-        return [nothing_claimed(f"the run {state}{told}")]
+        return [nothing_claimed(f"the run {state}" + (f"; so far: {result.brief}" if result.brief else ""))]
     room = registry.room(result.command)
     if room and room.claims:
         return list(room.claims(result)) or [nothing_claimed("nothing in this run came to its end")]
@@ -247,13 +208,12 @@ def claims_of(result: Result) -> list[Claim]:
 
 
 def photo_claims(photos: PhotoAgreement) -> list[Claim]:
-    """Return what photographs of a run's renderings say."""
     if not photos.photos or photos.interval is None:
         return []
     agreeing = photos.right_right + photos.wrong_wrong
-    extent = Extent(what="photographs that agree", count=agreeing, total=photos.photos, interval=photos.interval)
-    said = "Photographs and renderings agree (both right, or both wrong) in "
-    return [claim("measured", f"{said}{share_text(extent)}. The interval takes photographs as independent.", extent)]
+    extent = counted("photographs that agree", agreeing, photos.photos, photos.interval)
+    text = f"Photographs and renderings agree (both right, or both wrong) in {share_text(extent)}."
+    return [claim("measured", f"{text} The interval takes photographs as independent.", extent)]
 
 
 def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
@@ -270,24 +230,28 @@ def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
 
 
 NOT_NOTED = "not noted: the run is older than that"
+NO_CLAIM = "The run carries no claim; it is listed so that it is not left out unseen."
+WEIGHTED = "How common the conditions are is what the weights say, of their axes alone."
+NOT_WEIGHTED = "Nothing is said of how common the conditions are: no weights were given."
 
 
 def evidence_of(
-    name: str,
-    result: Result,
-    claims: Sequence[Claim],
-    settings: Mapping[str, object],
-    made: Mapping[str, str],
+    name: str, result: Result, claims: Sequence[Claim], settings: Mapping[str, object], made: Mapping[str, str],
     judged_by: Mapping[str, object] | None = None,
-) -> EvidenceRun:
+) -> EvidenceRun:  # fmt: skip
     """Return a run with what a reader needs to judge its claims: settings as its run.yaml has them, versions and
     digests as it noted them (empty of older runs), and the options of its task, such as thresholds."""
     values = {field: getattr(result, field) for field in type(result).model_fields}
     objects = values.get("object") or ", ".join(values.get("objects") or ())
     right = values.get("label_set") or settings.get("label")
+    lit_by = str(values.get("environment") or "")
+    moving = {name.partition(":")[0] for which in ("over", "controls") for name in values.get(which) or ()}
+    if lit_by and {"environment", "sky"} & moving:
+        attacked = isinstance(result, AttackSummary)
+        lit_by = f"varied, see below; the clean scene has {lit_by}" if attacked else f"{lit_by}, varied"
     about = {
         "Object": str(objects or ""),
-        "Environment": _lit_by(result),
+        "Environment": lit_by,
         "Model": str(values.get("model") or ""),
         "Names of its classes": str(settings.get("labels") or ""),
         "Prompt": str(settings.get("prompt") or ""),
@@ -299,34 +263,18 @@ def evidence_of(
     if isinstance(renders, Mapping):
         renders = ", ".join(f"{number} {name}" for name, number in renders.items() if number) or "none"
     return EvidenceRun(
-        run=name,
-        command=result.command,
-        ending=str(values.get("ending") or "done"),
-        claims=list(claims),
-        about={key: text for key, text in about.items() if text},
-        searched=searched_lines(result, settings),
-        measured=_measured(result, settings, judged_by or {}),
-        excluded=_excluded(result, claims),
+        run=name, command=result.command, ending=str(values.get("ending") or "done"), claims=list(claims),
+        about={key: text for key, text in about.items() if text}, searched=searched_lines(result, settings),
+        measured=_measured(result, settings, judged_by or {}), excluded=_excluded(result, claims),
         cost={
             "Renders": "those of its parts" if renders is None else str(renders),
             "Time": wording.seconds_text(seconds.get("total")),
         },
-        made_with=dict(made) or {"versions and files": NOT_NOTED},
-        command_line=str(values.get("command_line") or ""),
-    )
-
-
-def _lit_by(result: Result) -> str:
-    """What lights it, or that this is among what varied."""
-    name = str(getattr(result, "environment", "") or "")
-    moving = [*getattr(result, "over", ()), *getattr(result, "controls", ())]
-    if not {"environment", "sky"} & {control.partition(":")[0] for control in moving} or not name:
-        return name
-    return f"varied, see below; the clean scene has {name}" if isinstance(result, AttackSummary) else f"{name}, varied"
+        made_with=dict(made) or {"versions and files": NOT_NOTED}, command_line=str(values.get("command_line") or ""),
+    )  # fmt: skip
 
 
 def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
-    """Return what could change and how far, a line for each part of it."""
     lines = []
     if isinstance(result, AttackSummary):
         lines.append(attack_wording.changed_text(result))
@@ -335,10 +283,19 @@ def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
             for name, found in (result.configuration or {}).items()
             if found.low is not None and found.high is not None
         ]
-        lines += [attack_wording.over_text(result)] if result.over else []
+        lines += [f"{' and '.join(result.over)}, drawn anew for every picture"] if result.over else []
         lines += [f"{name}: {_span(varied)}, by chance" for name, varied in result.conditions.items()]
     elif isinstance(result, SweepSummary):
-        lines += _axes(result)
+        axes = dict[tuple[str, str], list[Any]]()
+        for row in result.axes:
+            if row.axis not in result.drawn:
+                axes.setdefault((row.axis, row.unit), []).append(row.value)
+        for (axis, unit), values in axes.items():
+            text = ", ".join(map(number_text, values))
+            if all(isinstance(value, tuple) for value in values):  # parts of one range
+                text = f"{min(low for low, _ in values):.4g} to {max(high for _, high in values):.4g}"
+            lines.append(f"{axis}: {text} {unit}".rstrip())
+        lines += [f"{name}: {_span(varied)}, drawn by chance" for name, varied in result.drawn.items()]
     controls = settings.get("controls") or {}
     for control in getattr(result, "controls", ()):
         given = controls.get(control) if isinstance(controls, Mapping) else None
@@ -352,21 +309,6 @@ def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
     return lines
 
 
-def _axes(result: SweepSummary) -> list[str]:
-    """The values of each axis of a sweep: a declared range, or names."""
-    spans, units, lines = dict[str, list[Any]](), {row.axis: row.unit for row in result.axes}, []
-    for row in result.axes:
-        if row.axis not in result.drawn:
-            spans.setdefault(row.axis, []).append(row.value)
-    for axis, values in spans.items():
-        if not all(isinstance(value, tuple) for value in values):
-            text = ", ".join(map(wording.number_text, values))
-        else:
-            text = f"{min(low for low, _ in values):.4g} to {max(high for _, high in values):.4g}"
-        lines.append(f"{axis}: {text} {units[axis]}".rstrip())
-    return lines + [f"{name}: {_span(varied)}, drawn by chance" for name, varied in result.drawn.items()]
-
-
 def _span(varied: VariedValue) -> str:
     if varied.low is None or varied.high is None:
         return " or ".join(varied.names or ["something"])
@@ -374,7 +316,7 @@ def _span(varied: VariedValue) -> str:
 
 
 def _measured(result: Result, settings: Mapping[str, object], judged_by: Mapping[str, object]) -> dict[str, str]:
-    worst = isinstance(result, SweepSummary)
+    trials = "Trials of the worst configuration" if isinstance(result, SweepSummary) else "Trials"
     facts = {
         "Policy": getattr(result, "policy", None),
         "Objective": getattr(result, "objective", None),
@@ -382,8 +324,8 @@ def _measured(result: Result, settings: Mapping[str, object], judged_by: Mapping
         "Steps": settings.get("steps"),
         "Seed": getattr(result, "seed", None),
         "Samples a pixel": getattr(result, "spp", None) or settings.get("spp"),
-        "Trials of the worst configuration" if worst else "Trials": settings.get("trials"),
-        "Judged with": ", ".join(f"{name} {wording.number_text(one)}" for name, one in judged_by.items() if one),
+        trials: settings.get("trials"),
+        "Judged with": ", ".join(f"{name} {number_text(value)}" for name, value in judged_by.items() if value),
     }
     named = {name: str(value) for name, value in facts.items() if value not in (None, "")}
     if isinstance(result, AttackSummary) and result.verified is not None:
@@ -398,7 +340,6 @@ def _measured(result: Result, settings: Mapping[str, object], judged_by: Mapping
 
 
 def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
-    """What a reader has to know beside the claims: what stood still, what failed, the run's own warnings."""
     lines = ["Nothing varied but what stands under What varied, and the noise of the renders."]
     if isinstance(result, AttackSummary):
         lines += [remark for remark in attack_wording.remarks(result) if remark not in result.warnings]
@@ -406,8 +347,8 @@ def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
         if bad.objectives or bad.gradient_elements:
             lines.append(f"Not finite: {bad.objectives} objectives, {bad.gradient_elements} numbers of gradients.")
         lines += [
-            f"The clean scene has {moved.parameter} {wording.number_text(moved.used)} {moved.unit} in place of "
-            f"{wording.number_text(moved.scene)}: the control leaves that out."
+            f"The clean scene has {moved.parameter} {number_text(moved.used)} {moved.unit} in place of "
+            f"{number_text(moved.scene)}: the control leaves that out."
             for moved in result.clean.moved
         ]
     if isinstance(result, SweepSummary) and result.not_finite:
@@ -415,12 +356,11 @@ def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
     if isinstance(result, SweepSummary) and result.looked_at < result.planned:
         lines.append(f"Only {result.looked_at} of {result.planned} planned configurations were looked at.")
     if all(claim.kind == "nothing claimed" for claim in claims):
-        lines.append("The run carries no claim; it is listed so that it is not left out unseen.")
+        lines.append(NO_CLAIM)
     return lines + list(getattr(result, "warnings", ()))
 
 
 SUITE = "suite"  # the note of a run of `test` that has its claims
-
 MOST_OF_PICTURE = 16 << 20  # bytes of a picture that is taken along
 
 
@@ -436,20 +376,20 @@ def collected(
         of_recipe = parts and _settings(folder).get("command") == "recipe"  # the runs that it consists of
         folders |= {part.resolve(): part for part in (parts if of_recipe else [folder])}
     for number, folder in enumerate(folders.values(), 1):
-        shown = {f"pictures/{number}-{file.name}": read_bytes(file, "a picture", MOST_OF_PICTURE)
-                 for file in engineering.pictures_of(folder)}  # fmt: skip
+        files = [folder / IMAGES / f"{name}.png" for name in PICTURES]
+        files = [file for file in files if file.is_file() and not file.is_symlink()][:3]
+        shown = {f"pictures/{number}-{file.name}": read_bytes(file, "a picture", MOST_OF_PICTURE) for file in files}
         pictures |= shown
         run, begun = _run(folder, criterion, exposure or {}), ""
         with suppress(OSError):  # when its settings were written
             begun = f"{datetime.fromtimestamp((folder / CONFIG).stat().st_mtime, timezone.utc):%Y-%m-%d %H:%M} UTC"
         told.append(run.model_copy(update={"pictures": list(shown), "begun": begun}))
         if model := run.about.get("Model"):
-            files = model, model.rpartition("@")[2]
+            of_model = model, model.rpartition("@")[2]
             models.append(model)
-            digests.append(" ".join(text for name, text in run.made_with.items() if name in files))
-    warnings = warnings_over(models, digests)
+            digests.append(" ".join(text for name, text in run.made_with.items() if name in of_model))
     unused = set(exposure or {}) - {row.axis for run in told for row in run.conditions}
-    warnings += [f"exposure: no run has the axis {axis}." for axis in sorted(unused)]
+    warnings = [*warnings_over(models, digests), *(f"exposure: no run has the axis {axis}." for axis in sorted(unused))]
     evidence = Evidence(
         runs=told, warnings=warnings, rules=list(RULES), version=__version__, by=by, criterion=criterion,
         written=f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
@@ -458,32 +398,35 @@ def collected(
     return evidence, pictures
 
 
-def _settings(folder: Path) -> Mapping[str, object]:
-    """What its run.yaml says; nothing where there is none that can be read."""
+def _settings(folder: Path) -> Mapping[str, Any]:
     with suppress(AdvsearchError):
         return read_yaml(folder / CONFIG)
     return {}
 
 
+def _noted(folder: Path, note: str) -> Any:
+    with suppress(AdvsearchError), Store(folder / STORE, read_only=True) as store:
+        return store.noted(note)
+    return None
+
+
 def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceRun:
     """One run; of one that has no summary, that it claims nothing."""
-    name, settings = typed_name(folder), _settings(folder)
-    made = _made_with(folder)
+    settings, made_with = _settings(folder), dict[str, dict[str, None]]()
+    noted = _noted(folder, MADE_WITH)  # at each sitting; of several that differ, all
+    for sitting in noted if isinstance(noted, list) else []:
+        for name, text in sitting.items() if isinstance(sitting, Mapping) else ():
+            made_with.setdefault(str(name), {})[str(text)] = None
+    made = {name: ", then ".join(texts) for name, texts in made_with.items()}
     if not (folder / SUMMARY).is_file():
         facts = {"Object": str(settings.get("object") or ""), "Model": str(settings.get("model") or "")}
         return EvidenceRun(
-            run=name,
-            command=str(settings.get("command") or "unknown"),
-            ending="none yet",
+            run=typed_name(folder), command=str(settings.get("command") or "unknown"), ending="none yet",
             claims=[nothing_claimed("the run has no result yet: it is still working, or was stopped")],
-            about={key: text for key, text in facts.items() if text},
-            searched=[],
-            measured={},
-            excluded=["The run carries no claim; it is listed so that it is not left out unseen."],
-            cost={},
-            made_with=made or {"versions and files": NOT_NOTED},
+            about={key: text for key, text in facts.items() if text}, searched=[], measured={}, excluded=[NO_CLAIM],
+            cost={}, made_with=made or {"versions and files": NOT_NOTED},
             command_line=f"advsearch run {folder / CONFIG}",
-        )
+        )  # fmt: skip
     result, photographs, rows = read_result(folder), list[Claim](), list[Row]()
     if (folder / IMAGES / FOLDER).is_dir():
         from advsearch.questions.photographs.carry_out import photo_agreement  # it brings torch, which takes a second
@@ -491,46 +434,44 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
         photographs = photo_claims(photo_agreement(folder))
         with Store(folder / STORE, read_only=True) as store:
             rows = list(store.rows(PHOTO)) if photographs else []
-    run = evidence_of(name, result, [*claims_of(result), *photographs], settings, made, _judged_by(settings))
+    claims = [*claims_of(result), *photographs]
+    run = evidence_of(typed_name(folder), result, claims, settings, made, _judged_by(settings.get("task")))
     outer = _settings(folder.resolve().parent.parent)
     few = [QUICK] if outer.get("command") == "recipe" and outer.get("quick") is True else []
-    basis = list(_read_by(result))
+    basis = []  # the sweeps whose rows it reads: it is about what varied there
+    sides = [side.run for side in getattr(result, "sides", ())]
+    for name in dict.fromkeys([*getattr(result, "sweeps", ()), *sides]):
+        with suppress(AdvsearchError):
+            swept = find_run(str(name))
+            basis.append((read_result(swept), _settings(swept)))
     searched = list(dict.fromkeys(line for read in basis for line in searched_lines(*read)))
-    searched = searched or (_of_a_suite(folder) if result.command == "test" else run.searched)
-    domain = engineering.domain_of(basis[0][0] if basis else result, settings, searched)
-    conditions = engineering.conditions_of(result)
-    weighted = engineering.exposure_lines(result, conditions, exposure)
+    searched = searched or (_of_a_suite(_noted(folder, SUITE)) if result.command == "test" else run.searched)
+    domain = domain_of(basis[0][0] if basis else result, settings, searched)
+    conditions = conditions_of(result)
+    weighted = exposure_lines(result, conditions, exposure)
     compared = sum(claim.extent.total for claim in photographs if claim.extent)
-    asked = [] if criterion is None else engineering.criterion_lines(run.claims, conditions, criterion)
+    photographed = f"Only {compared} photographs were" if compared else "No photograph was"
+    not_shown = [f"{photographed} compared with renderings: all else is about renderings."]
+    if still := [part for part, text in domain.items() if text.startswith("not varied")]:
+        not_shown.append(f"Nothing is said of other values of: {', '.join(still)}.")
+    not_shown.append(WEIGHTED if weighted else NOT_WEIGHTED)
     more = {
         "searched": searched,
         "excluded": [*few, *run.excluded],
-        "criterion": asked,
-        "triggering": engineering.triggering_conditions(result),
+        "criterion": [] if criterion is None else criterion_lines(claims, conditions, criterion),
+        "triggering": triggering_conditions(result),
         "exposure": weighted,
         "conditions": conditions,
-        "photographs": engineering.photograph_conditions(result, rows),
+        "photographs": conditions_of(result, rows),
         "domain": domain,
-        "not_shown": engineering.not_shown(domain, compared, weighted=bool(weighted)),
+        "not_shown": not_shown,
     }
     return run.model_copy(update=more)
 
 
-def _read_by(result: Result) -> Iterator[tuple[Result, Mapping[str, object]]]:
-    """The sweeps whose rows a run reads, with their settings: it is about what varied there."""
-    sides = [side.run for side in getattr(result, "sides", ())]
-    for name in dict.fromkeys([*getattr(result, "sweeps", ()), *sides]):
-        with suppress(AdvsearchError):
-            folder = find_run(str(name))
-            yield read_result(folder), _settings(folder)
-
-
-def _of_a_suite(folder: Path) -> list[str]:
-    """What the claims of a suite vary, as the run has kept it."""
+def _of_a_suite(suite: Any) -> list[str]:
     lines = defaultdict[str, list[str]](list)
     try:
-        with Store(folder / STORE, read_only=True) as store:
-            suite: Any = store.noted(SUITE)
         for name, claim in suite["claims"].items():
             settings = {**suite["settings"], **claim["settings"]}
             controls = settings.get("controls") or {}
@@ -541,21 +482,19 @@ def _of_a_suite(folder: Path) -> list[str]:
                 lines[f"{control}: {text}"].append(str(name))
             if settings.get("environment"):
                 lines[f"environment: {settings['environment']}"].append(str(name))
-    except (AdvsearchError, KeyError, AttributeError, TypeError, ValueError):
+    except (KeyError, AttributeError, TypeError, ValueError):
         return ["as the claims of its suite say, which cannot be read any more"]
     return [f"{line} ({', '.join(names)})" for line, names in lines.items()]
 
 
-def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
-    """The options of the task that a run was judged by; nothing of one that is not to be had here."""
-    given: Any = settings.get("task")
-    if given is None:
+def _judged_by(named: Any) -> dict[str, object]:
+    if named is None:
         return {}
     from advsearch.tasks import make_task  # they bring torch, which takes a second
     from advsearch.tasks.together import Together
 
     with suppress(AdvsearchError):
-        task = make_task(given)
+        task = make_task(named)
         alone = {f"{part.name}.": part for part in task.parts} if isinstance(task, Together) else {"": task}
         return {
             f"{of}{option.name}": getattr(part, option.name)
@@ -564,17 +503,3 @@ def _judged_by(settings: Mapping[str, object]) -> dict[str, object]:
             if option.metadata != FROM_RUN
         }
     return {}
-
-
-def _made_with(folder: Path) -> dict[str, str]:
-    """What the run noted at each sitting; of several that differ, all."""
-    try:
-        with Store(folder / STORE, read_only=True) as store:
-            noted = store.noted(MADE_WITH)
-    except AdvsearchError:
-        return {}
-    facts: dict[str, dict[str, None]] = {}
-    for sitting in noted if isinstance(noted, list) else []:
-        for name, text in sitting.items() if isinstance(sitting, Mapping) else ():
-            facts.setdefault(str(name), {})[str(text)] = None
-    return {name: ", then ".join(texts) for name, texts in facts.items()}

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from advsearch.report.shown import Claim, Html, element, join_html
 from advsearch.report.wording import count, interval_text
-from advsearch.runs.results import Fields, Interval, Result
+from advsearch.runs.results import Fields, Interval, Result, optional
 from advsearch.viewer.document import data_url, document, heading, study_table
 
 
@@ -64,7 +64,7 @@ class Evidence(Result):
     version: str = Field(description="of advsearch, that wrote this")
     written: str = Field("", description="when, UTC")
     by: str = Field("", description="who, as given; absent otherwise")
-    criterion: float | None = Field(None, description="share of right predictions that was asked for; absent otherwise")
+    criterion: float | None = optional("share of right predictions that was asked for; absent otherwise")
     crosswalk: list[dict[str, str]] = Field([], description="which heading of a standard each figure serves")
 
 
@@ -95,7 +95,6 @@ NO_CONFORMITY = (
 
 
 def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
-    """Yield what shares by condition are of, the heads of their table and its rows, of those that a run has."""
     for title, first, verb, conditions in (
         ("Right", "condition", "right", run.conditions),
         ("Photographs that agree", "photographs of", "agree", run.photographs),
@@ -106,26 +105,23 @@ def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[
 
 
 def markdown(evidence: Evidence) -> str:
-    """Return the whole as Markdown, to be put into a model card."""
-    lines = ["# Evidence", "", *(f"> {text}" for text in evidence.warnings), *([""] if evidence.warnings else [])]
+    def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+        return [*(f"| {' | '.join(map(_plain, row))} |" for row in (heads, ["---"] * len(heads), *rows)), ""]
+
+    lines = ["# Evidence", "", *(f"> {text}" for text in evidence.warnings), *[""] * bool(evidence.warnings)]
     for run in evidence.runs:
         lines += [f"## {_plain(run.run)}", ""]
         lines += [*(f"- **{claim.kind}**: {_plain(claim.statement)}" for claim in run.claims), ""]
         for _, heads, rows in tables_of(run):
-            lines += [*_table(heads, rows), ""]
+            lines += table(heads, rows)
         lines += [f"![{name}]({name})" for name in run.pictures] + [""] * bool(run.pictures)
         for title, facts in sections(run).items():
             lines += [f"{title}:", "", *(f"- {_plain(text)}" for text in facts), ""]
         if run.command_line:
             lines += ["To repeat it:", "", "```sh", run.command_line.replace("```", "` ` `"), "```", ""]
     lines += ["## How to read this", "", *(f"- {text}" for text in evidence.rules), ""]
-    lines += ["## Where it belongs", "", *_table(CROSSWALK_HEADS, CROSSWALK), "", NO_CONFORMITY, ""]
+    lines += ["## Where it belongs", "", *table(CROSSWALK_HEADS, CROSSWALK), NO_CONFORMITY, ""]
     return "\n".join([*lines, _signed(evidence)]) + "\n"
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """A table as Markdown has it."""
-    return [f"| {' | '.join(map(_plain, row))} |" for row in (heads, ["---"] * len(heads), *rows)]
 
 
 def _signed(evidence: Evidence) -> str:
@@ -134,8 +130,6 @@ def _signed(evidence: Evidence) -> str:
 
 
 def sections(run: EvidenceRun) -> dict[str, list[str]]:
-    """Return what stands beside the claims of a run, in lines under their headings."""
-
     def named(facts: Mapping[str, str]) -> list[str]:
         return [f"{name}: {text}" for name, text in facts.items()]
 
@@ -156,7 +150,6 @@ def sections(run: EvidenceRun) -> dict[str, list[str]]:
 
 
 def _plain(text: str) -> str:
-    """Text that Markdown shows as it is."""
     return re.sub(r"([\\<>*_\[\]`|])", r"\\\1", " ".join(text.split()))
 
 
@@ -164,19 +157,15 @@ CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
 
 
 def evidence_page(evidence: Evidence, pictures: Mapping[str, bytes] | None = None) -> str:
-    """Return the page; `pictures` has the contents of those that the runs name."""
     claims = [claim for run in evidence.runs for claim in run.claims]
     carried = sum(claim.kind != "nothing claimed" for claim in claims)
     said = f"What {count(len(evidence.runs), 'run')} show{'s' * (len(evidence.runs) == 1)}, and no more than that."
     main = element(
-        "main",
-        *(_run_html(run, pictures or {}) for run in evidence.runs),
-        element("h2", "How to read this"),
+        "main", *(_run_html(run, pictures or {}) for run in evidence.runs), element("h2", "How to read this"),
         element("ul", *(element("li", text.replace("`", "")) for text in evidence.rules)),
-        element("h2", "Where it belongs"),
-        study_table(CROSSWALK_HEADS, CROSSWALK),
+        element("h2", "Where it belongs"), study_table(CROSSWALK_HEADS, CROSSWALK),
         element("p", f"{NO_CONFORMITY} {_signed(evidence)}", class_="soft"),
-    )
+    )  # fmt: skip
     header = heading(f"evidence; {carried} of {len(claims)} statements carry a claim", said, evidence.warnings)
     return document("evidence", header, main, footer="evidence. This page needs no other file.")
 
@@ -187,26 +176,20 @@ def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> Html:
         extent = claim.extent
         counted = [f"{extent.count} of {extent.total}", interval_text(extent.interval)] if extent else ["", ""]
         rows.append([claim.kind, claim.statement, *counted])
+    parts = [element("h2", f"{run.run} ({run.command})"), study_table(CLAIM_HEADS, rows)]
+    if run.pictures:
+        data = {name: data_url(pictures[name], "image/png") for name in run.pictures if name in pictures}
+        images = (element("figure", element("img", src=url, alt=name)) for name, url in data.items())
+        parts.append(element("div", *images, class_="pictures"))
+    for title, heads, cells in tables_of(run):
+        summary = element("summary", f"{title} by condition, {len(cells)} rows")
+        parts.append(element("details", summary, study_table(heads, cells)))
     facts = [
         element("tr", element("th", name, scope="row"), element("td", *(element("div", line) for line in lines)))
         for name, lines in sections(run).items()
     ]
     table = element("table", element("tbody", *facts), class_="facts")
-    images = [
-        element("figure", element("img", src=data_url(pictures[name], "image/png"), alt=name))
-        for name in run.pictures
-        if name in pictures
-    ]
-    conditions = []
-    for title, heads, cells in tables_of(run):
-        summary = element("summary", f"{title} by condition, {len(cells)} rows")
-        conditions.append(element("details", summary, study_table(heads, cells)))
-    again = join_html(element("h2", "Do it again"), element("pre", run.command_line, class_="wrap"))
-    return join_html(
-        element("h2", f"{run.run} ({run.command})"),
-        study_table(CLAIM_HEADS, rows),
-        element("div", *images, class_="pictures") if run.pictures else None,
-        *conditions,
-        element("details", element("summary", "On what, how, and what is left out"), table, open=""),
-        again if run.command_line else None,
-    )
+    parts.append(element("details", element("summary", "On what, how, and what is left out"), table, open=""))
+    if run.command_line:
+        parts += [element("h2", "Do it again"), element("pre", run.command_line, class_="wrap")]
+    return join_html(*parts)

@@ -18,6 +18,6 @@ from advsearch.questions.stability.result import shown as shown
 )
 def stability(asked: Asked[StabilityConfig]) -> StabilityResult:
     """Try stiff and extreme scenes, and say whether each of them holds (docs/stability.md)."""
-    from advsearch.questions.stability.scenes import stability_from_config  # imports torch
+    from advsearch.questions.stability.scenes import tried_cases  # imports torch
 
-    return stability_from_config(asked.config, progress=asked.progress, resumed=asked.resumed)
+    return tried_cases(asked)

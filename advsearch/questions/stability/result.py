@@ -75,7 +75,6 @@ def check(what: str, value: float, least: float | None = None, most: float | Non
 
 
 def holds(what: str, truth: bool) -> Check:
-    """Return the check that something is true: 1, else 0."""
     return check(what, float(truth), 1.0, 1.0)
 
 
@@ -126,7 +125,6 @@ COLUMNS: Mapping[str, Column] = {
 
 
 def shown(result: StabilityResult) -> ShownResult:
-    """Return the cases, what was measured, what decides where a case fell short, and what was not run."""
     short = [row for row in result.rows if row.status != OK]
     numbers = [
         [f"{row.case}: {name}", f"{value:.3g}"]
@@ -162,7 +160,6 @@ class Outcome:
     measured: Mapping[str, float] = field(default_factory=dict)
 
     def also(self, *more: Check, **known: Any) -> Outcome:
-        """Return it with further checks, and other fields where they are known."""
         return replace(self, checks=[*self.checks, *more], **known)
 
 

@@ -7,12 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Domain, Evaluation, Query, SearchResult, search
+from advsearch.attacks import PGD, Domain, Evaluation, Policy, Query, SearchResult, search
 from advsearch.controls import Space, make_control, make_space
 from advsearch.engine import judging
 from advsearch.engine.gradients import Loss, derivatives, smooth_loss
@@ -34,21 +35,15 @@ ERROR = 0.1  # relative error that the mean of a gradient may have beyond what i
 DOUBT = 0.4  # the noise of a comparison, as a share of the derivative, from which it decides nothing
 SHARPNESS = 20.0  # logits per unit of the linear loss that the searched model returns
 SAME_PICTURE = 2e-3  # mean difference of two pictures that should be one: an 8-bit level is 4e-3
-
 ControlSettings = Mapping[str, Mapping[str, object]]
 Thing = str | Path | ObjectAsset | Callable[[], ObjectAsset]
 """What a scene shows; a function makes it when the case runs."""
 
 
 def small(
-    controls: ControlSettings,
-    thing: Thing = "mug",
-    *,
-    environment: str | Path | EnvironmentAsset | None = None,
-    settings: Mapping[str, float] | None = None,
-    parts: Sequence[ScenePart] = (),
-    denoise: str = "none",
-) -> Renderer:
+    controls: ControlSettings, thing: Thing = "mug", *, environment: str | Path | EnvironmentAsset | None = None,
+    settings: Mapping[str, float] | None = None, parts: Sequence[ScenePart] = (), denoise: str = "none",
+) -> Renderer:  # fmt: skip
     """Return `render(u, seed, spp)` of a small picture: as `Scene.renderer`, with parts of our own.
 
     Its differences are taken over a pixel: the losses of these cases are smooth.
@@ -74,7 +69,6 @@ def plain_environment() -> EnvironmentAsset:
 
 
 def grey_map(value: float, texel: float | None = None) -> EnvironmentAsset:
-    """Return a grey map (16, 32, 3), one texel of it different."""
     radiance: Floats = np.full((16, 32, 3), value, np.float32)
     if texel is not None:
         radiance[4, 10] = texel
@@ -99,13 +93,11 @@ def checked(mesh: Mesh) -> ObjectAsset:
 
 
 def painted(texels: np.ndarray) -> ObjectAsset:
-    """Return the mug with another texture (h, w) of greys, display-referred."""
     grey = np.repeat(texels[:, :, None], 3, axis=2).astype(np.float32)
     return replace(library.load_object("mug"), name="painted", base_color=grey)
 
 
 def black_and_white() -> ObjectAsset:
-    """Return the mug with 8 x 8 texels that are exactly 0 and 1."""
     return painted(np.indices((8, 8)).sum(axis=0) % 2)
 
 
@@ -120,22 +112,11 @@ Range = tuple[float | None, float | None]
 
 
 def seen(
-    controls: ControlSettings,
-    thing: Thing = "mug",
-    *,
-    u: Sequence[float] | Mapping[int, float] | None = None,
-    spp: int = SPP,
-    compare: bool = True,
-    seeds: tuple[int, int] = (3, 12),
-    repeats: int = 24,
-    evaluations: int = 3,
-    mean: Range | None = None,
-    gradient: Range | None = None,
-    ending: str = "",
-    beside: Mapping[str, object] | None = None,
-    apart: Range = (None, SAME_PICTURE),
-    **scene: object,
-) -> Outcome:
+    controls: ControlSettings, thing: Thing = "mug", *, u: Sequence[float] | Mapping[int, float] | None = None,
+    spp: int = SPP, compare: bool = True, seeds: tuple[int, int] = (3, 12), repeats: int = 24, evaluations: int = 3,
+    mean: Range | None = None, gradient: Range | None = None, ending: str = "",
+    beside: Mapping[str, object] | None = None, apart: Range = (None, SAME_PICTURE), **scene: object,
+) -> Outcome:  # fmt: skip
     """Render a scene, differentiate it, compare the gradient with differences, which costs most of the time, and search
     from there.
 
@@ -155,15 +136,19 @@ def seen(
     _, slope = renderer.gradient(loss, at, 0, spp)
     finite = bool(torch.isfinite(picture).all()) and bool(torch.isfinite(slope).all())
     rows = compared(renderer, at, spp=spp, seeds=seeds, repeats=repeats) if compare else []
-    result = searched(renderer, at, evaluations, spp=spp)
+    # a linear model of two classes: its logits are 0, and so many times the rise of the loss over the start, less 1
+    here, domain = float(loss(shown(renderer, at, 0, spp))), search_domain(renderer, at)
+    rise = lambda image: SHARPNESS * (loss(image) - here) - 1.0  # noqa: E731
+    steps = evaluations * (1 + domain.gradient_cost) + 1
+    result = searched(renderer, rise, steps, spp=spp, start=at, candidates=1, repeats=1)
     checks = [
         holds("the picture is in [0, 1]", float(picture.min()) >= 0.0 and float(picture.max()) <= 1.0),
         check("values that were NaN or infinite", float(renderer.non_finite), 0.0, 0.0),
         check("objectives that were NaN or infinite", float(result.non_finite_objectives), 0.0, 0.0),
     ]
-    if rows:
+    worst = max(rows, key=lambda row: (row.excess, row.bias or 0.0), default=None)
+    if worst is not None:
         unsure = max(rows, key=lambda row: row.doubt or 0.0)
-        worst = max(rows, key=lambda row: (row.excess, row.bias or 0.0))
         checks.append(check(f"noise of the comparison, {unsure.name}", unsure.doubt or 0.0, most=DOUBT))
         checks.append(check(f"gradient error beyond the noise, {worst.name}", worst.excess, most=ERROR))
     measured = {"mean": float(picture.mean()), "largest gradient": float(slope.abs().max())}
@@ -177,17 +162,11 @@ def seen(
         other = small(**{"controls": controls, **beside})  # type: ignore[arg-type]
         difference = float((shown(renderer, at) - shown(other, other.start)).abs().mean())
         checks.append(check("mean difference from the picture beside it", difference, *apart))
-    return Outcome(
-        checks,
-        finite and renderer.non_finite == 0,
-        max(rows, key=lambda row: (row.excess, row.bias or 0.0)).bias if rows else None,
-        result.ending.value,
-        measured,
-    )
+    finite = finite and renderer.non_finite == 0
+    return Outcome(checks, finite, worst.bias if worst else None, result.ending.value, measured)
 
 
 def shown(renderer: Renderer, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
-    """Return the picture (H, W, 3) of a configuration, without a graph."""
     with torch.no_grad():
         return renderer(u, seed, spp)
 
@@ -219,46 +198,29 @@ def inward(renderer: Renderer, slope: Tensor, of: Tensor | float, seeds: int, sp
     return float(slope @ direction), math.fsum(wanted) / seeds
 
 
-class LossEval:
-    """Evaluates configurations of a renderer by a loss of the picture; over 0 is a success."""
-
-    def __init__(self, renderer: Renderer, loss: Loss, spp: int) -> None:
-        self.renderer, self.loss, self.spp = renderer, loss, spp
-
-    def __call__(self, query: Query) -> Evaluation:
-        """Answer a query."""
-        renderer, derivative = self.renderer, None
-        u, seed, spp = query.u, query.number, self.spp * query.samples
-        bad, renders = renderer.non_finite, renderer.renders
-        if query.gradient:
-            value, derivative = renderer.gradient(self.loss, u, seed, spp, free=query.gradient == "free")
-        else:
-            value = self.loss(shown(renderer, u, seed, spp))
-        objective = float(value)
-        cost = (renderer.renders - renders) * query.samples
-        return Evaluation(objective, derivative, objective > 0.0, renderer.non_finite - bad, cost)
+def evaluated(renderer: Renderer, loss: Loss, spp: int, query: Query) -> Evaluation:
+    """Evaluate a configuration by a loss of the picture; over 0 is a success."""
+    u, seed, spp, derivative = query.u, query.number, spp * query.samples, None
+    bad, renders = renderer.non_finite, renderer.renders
+    if query.gradient:
+        value, derivative = renderer.gradient(loss, u, seed, spp, free=query.gradient == "free")
+    else:
+        value = loss(shown(renderer, u, seed, spp))
+    cost = (renderer.renders - renders) * query.samples
+    return Evaluation(float(value), derivative, float(value) > 0.0, renderer.non_finite - bad, cost)
 
 
-def searched(renderer: Renderer, u: Tensor, evaluations: int, *, spp: int = SPP) -> SearchResult:
-    """Search for a picture that a linear model of two classes gets wrong.
-
-    Its logits are 0 and `SHARPNESS` times the rise of the smooth linear loss over the configuration u, less 1.
-    """
-    loss = smooth_loss(renderer.formation.resolution)
-    here = float(loss(shown(renderer, u, 0, spp)))
-    evaluate = LossEval(renderer, lambda image: SHARPNESS * (loss(image) - here) - 1.0, spp)
-    domain = search_domain(renderer, u)
-    steps = evaluations * (1 + domain.gradient_cost) + 1
-    return search(partial(map, evaluate), domain, PGD(), steps=steps, seed=0, candidates=1, repeats=1)
+def searched(
+    renderer: Renderer, loss: Loss, steps: int, *, spp: int = SPP, start: Tensor | None = None,
+    policy: Policy[Any] | None = None, **more: Any,
+) -> SearchResult:  # fmt: skip
+    """Search for a picture of a loss over 0."""
+    evaluate, domain = partial(evaluated, renderer, loss, spp), search_domain(renderer, start)
+    return search(partial(map, evaluate), domain, policy or PGD(), steps=steps, seed=0, **{"candidates": 0, **more})
 
 
 def search_domain(renderer: Renderer, start: Tensor | None = None) -> Domain:
-    """Return where a search of a renderer's space may look, from its start or another one."""
     space = renderer.space
     assert isinstance(space, Space)
-    return judging.domain_of(
-        space.controls,
-        renderer.start if start is None else start,
-        gradient_cost=renderer.plan.renders,
-        partial_gradients=True,
-    )
+    u, cost = renderer.start if start is None else start, renderer.plan.renders
+    return judging.domain_of(space.controls, u, gradient_cost=cost, partial_gradients=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,12 +15,12 @@ import OpenEXR
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Adam, Auto, Query, search
+from advsearch.attacks import PGD, Adam, Auto, Query
 from advsearch.controls.occlusion import sphere
 from advsearch.engine.gradients import smooth_loss
-from advsearch.engine.record import Results, kept_rows
+from advsearch.engine.record import Results, taken_rows
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.progress import NullProgress, Progress
+from advsearch.question import Asked
 from advsearch.questions.stability.result import (
     CASES,
     Case,
@@ -41,20 +40,20 @@ from advsearch.questions.stability.scene import (
     SHARPNESS,
     SPP,
     ControlSettings,
-    LossEval,
     black_and_white,
     checked,
     compared,
     dark,
+    evaluated,
     grey_map,
     inward,
     mesh_of,
     search_domain,
+    searched,
     seen,
     shown,
     small,
 )
-from advsearch.runs.directory import RunDirectory
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset, normalised
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world
@@ -71,7 +70,6 @@ DARKNESS = grey_map(0.0)
 
 
 def exposed(control: str, low: float, high: float) -> dict[str, object]:
-    """A picture ten stops over or under, and its gradient there."""
     controls = {control: {"exposure": [low, high]}, "texture": {"resolution": 8}}
     return {"controls": controls, "u": {0: float(high > 0.0)}, "slow": control == "environment"}
 
@@ -137,14 +135,13 @@ def plateau(low: float, high: float) -> Outcome:
     """
     renderer = small({"camera": {"exposure": [low, high]}})
     start, checks, endings, flat = torch.ones_like(renderer.start), [], [], 0
-    evaluate = LossEval(renderer, lambda image: 0.9 - image.mean(), 2)
+    loss = lambda image: 0.9 - image.mean()  # noqa: E731
     for policy in (PGD(), Adam(), Auto()):
-        domain = search_domain(renderer, start)
-        result = search(partial(map, evaluate), domain, policy, steps=PLATEAU_STEPS, seed=0, candidates=0)
+        result = searched(renderer, loss, PLATEAU_STEPS, spp=2, start=start, policy=policy)
         flat += sum(record.gradient_norm == 0.0 for record in result.history)
         checks.append(holds(f"{policy.name} finds a picture that is not white", result.best_objective > 0.0))
         endings.append(f"{policy.name}: {result.ending.value}")
-    slope = evaluate(Query(start, 0, gradient=True)).gradient
+    slope = evaluated(renderer, loss, 2, Query(start, 0, gradient=True)).gradient
     assert slope is not None
     at_first = check("gradient at the start", float(slope.abs().max()), 0.0, 0.0)
     measured = {"evaluations without a gradient": float(flat)}
@@ -179,13 +176,11 @@ def _glass(part: GlassBall) -> Translation:
 
 
 def glass() -> GlassBall:
-    """A ball of clear glass between the mug and the camera, which covers part of it."""
     x, y, z = (float(value) for value in camera_to_world(describe("mug"))[:3, 3] * 0.6 + np.array([0.0, 0.0, 0.2]))
     return GlassBall("glass", (x, y, z), 0.3)
 
 
 def surface(searched: tuple[str, ...], slow: bool = True, **values: float) -> dict[str, object]:
-    """A surface with numbers at the ends of their range, and the derivative by some of them there."""
     settings = {f"material.{name}": value for name, value in values.items()}
     return {"controls": {"material": {name: [0.0, 1.0] for name in searched}}, "settings": settings, "slow": slow}
 
@@ -221,9 +216,7 @@ def texels_at_the_ends() -> Outcome:
     slope = torch.stack([raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]).mean(dim=0)
     gradient, wanted = inward(renderer, slope, 1.0, 8, REFERENCE_SPP)
     error = abs(gradient / wanted - 1.0)
-    best = search(
-        partial(map, LossEval(renderer, loss, SPP)), search_domain(renderer), PGD(), steps=3, seed=0, candidates=0
-    ).best_u
+    best = searched(renderer, loss, 3).best_u
     return seen(controls, black_and_white, compare=False).also(
         check("gradient error along a direction that points inwards", error, most=ERROR),
         check("smallest texel of the adversarial configuration", float(best.min()), least=0.0),
@@ -242,7 +235,6 @@ ONE_TEXEL = {3 * (SIDE**2 // 2 + SIDE // 2) + channel: 1.0 for channel in range(
 
 
 def thrown(u: Sequence[float] | Mapping[int, float] = WHOLE, **projector: float) -> dict[str, object]:
-    """A white picture on the mug, or another one; its gradient is finite and not zero."""
     controls = {"projector": {"resolution": SIDE, **projector}}
     return {"controls": controls, "u": u, "compare": False, "gradient": (1e-12, None)}
 
@@ -292,7 +284,6 @@ BARE = {"ground.size": 0.0}  # settings without the ground, so that a dark objec
 
 
 def mesh(thing: ObjectAsset, beside: ObjectAsset | None = None) -> dict[str, object]:
-    """A mesh of our own, seen from the front: painted and shifted."""
     like = {"beside": {"thing": beside, "settings": FRONT}} if beside else {}
     return {"controls": PAINTED, "thing": thing, "settings": FRONT, "slow": True, **like}
 
@@ -311,13 +302,11 @@ def box_in_a_file(scale: float = 1.0, shift: float = 0.0) -> ObjectAsset:
 
 
 def from_a_file(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
-    """A box in a file, which has to look like the same box at home."""
     thing = partial(box_in_a_file, scale, shift)
     return {"controls": SHIFT, "thing": thing, "compare": False, "beside": {"thing": box_in_a_file}}
 
 
 def outline(controls: ControlSettings) -> dict[str, object]:
-    """The mug in black on a bare sky, so that only its outline moves."""
     return {"controls": controls, "thing": dark, "settings": BARE, "u": [0.5]}
 
 
@@ -403,44 +392,32 @@ for control, name in (("pose", "yaw"), ("camera", "azimuth"), ("environment", "r
 # ---- `stability`: stiff and extreme scenes, and whether each of them holds ------------------------------------------
 
 
-def stability_from_config(
-    config: StabilityConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> StabilityResult:
+def tried_cases(asked: Asked[StabilityConfig]) -> StabilityResult:
     """Run cases of the suite one after the other, until they are done, the time is up or there is an interrupt.
 
     A case that is done is stored at once: a run that was stopped goes on with the case that it was at.
     """
-    progress, begun = progress or NullProgress(), time.perf_counter()
-    cases = chosen(config.cases, config.groups)
-    with RunDirectory.of(config, resumed) as run:
-        results = Results(run, config.seconds)
+    cases, progress = chosen(asked.config.cases, asked.config.groups), asked.progress
+    results = Results(asked.run, asked.config.seconds)
 
-        def rows() -> Iterator[CaseRow]:
-            hint = "`case` and `group` pick some, `seconds` stops before the next one"
-            progress.stage("trying stiff and extreme scenes", len(cases), hint=hint)
-            for case in cases:
-                known = results.stored(case.name) is not None
-                row = results.row(case.name, CaseRow, case.run)
-                yield row
-                if not known:
-                    progress.message(f"{case.name}: {row.status}, {row.seconds:.1f} s")
-                progress.advance(1)
+    def rows() -> Iterator[CaseRow]:
+        hint = "`case` and `group` pick some, `seconds` stops before the next one"
+        progress.stage("trying stiff and extreme scenes", len(cases), hint=hint)
+        for each in cases:
+            known = results.stored(each.name) is not None
+            row = results.row(each.name, CaseRow, each.run)
+            yield row
+            if not known:
+                progress.message(f"{each.name}: {row.status}, {row.seconds:.1f} s")
+            progress.advance(1)
 
-        def result(rows: Sequence[CaseRow], ending: str) -> StabilityResult:
-            return StabilityResult(
-                run=str(run.path),
-                ending=ending,
-                rows=list(rows),
-                not_run=[case.name for case in cases[len(rows) :]],
-                seconds={"total": time.perf_counter() - begun},
-                command_line=config.command_line(),
-            )
+    def result(rows: list[CaseRow]) -> StabilityResult:
+        return asked.result(StabilityResult, rows=rows, not_run=[each.name for each in cases[len(rows) :]])
 
-        return kept_rows(run, results, rows(), result)
+    return taken_rows(asked, results, rows(), result)
 
 
 def sentences() -> dict[str, str]:
-    """Return what must hold in each case, by its name; behind the group that it is of."""
     return {case.name: f"{case.group}: {case.holds}" for case in CASES}
 
 
@@ -518,13 +495,12 @@ def light_rotation_texel() -> Outcome:
     steps = [0.2, renderer.plan.groups[1].step * 2.0, 0.08]
     second = hessian(lambda at: SHARPNESS * float(loss(shown(renderer, at, 0, 64))), u, directions, steps)
     units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
-    domain = search_domain(renderer, u)
     paths: list[list[Tensor]] = []
     for scale in (1.0, RATIO):
-        evaluate = LossEval(renderer, partial(lambda scale, image: scale * loss(image), scale), 8)
         paths.append([])
         note = lambda record, at, evaluation: paths[-1].append(at)  # noqa: E731
-        result = search(partial(map, evaluate), domain, PGD(), steps=18, seed=0, candidates=0, on_step=note)
+        scaled = partial(lambda scale, image: scale * loss(image), scale)
+        result = searched(renderer, scaled, 18, spp=8, start=u, on_step=note)
     path, again = map(torch.stack, paths)
     moved = (path - path[0]).abs().amax(dim=0)
     names = {"condition number in u": second, "condition number in watts, degrees and sRGB": units @ second @ units}

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
 import secrets
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import advsearch.questions.test.counterexamples as beside
@@ -60,7 +59,6 @@ def test_from_config(
         described = suites.read_suite(config.suite)
         seed = secrets.randbelow(2**31) if config.fresh else described.seed if config.seed is None else config.seed
         described = described.model_copy(update={"seed": seed})
-    seconds = config.seconds or described.seconds or math.inf
     added = None if config.add is None else beside.add(config.suite, config.add)
     try:
         planned = _planned(described, config, added)
@@ -71,77 +69,62 @@ def test_from_config(
         if added is not None:
             beside.remove(added)
         raise InputError(f"{config.suite}: {error}") from None
-
-    def passed() -> float:
-        return time.perf_counter() - begun
-
     with RunDirectory.of(config, resumed) as run:
         run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
         for claim in planned:
             run.note_sitting(claim.config)
-        trial = Trial(
-            run, described.confidence, lambda: passed() >= seconds, lambda: max(0.001, seconds - passed()),
-            config.workers, config.cluster, progress, remarks,
-        )  # fmt: skip
         for remark in remarks:
             progress.message(remark)
-        suite_run = _SuiteRun(config, described, planned, trial, beside.read_expected(config.suite))
+        trial = Trial(run, config, described, begun, progress, remarks)
+        suite_run = _SuiteRun(trial, planned, beside.read_expected(config.suite))
         ending = suite_run.carry_out()
         if added is not None and suite_run.results[0].answer != FAILED:
             beside.remove(added)
             raise InputError(f"add: the adversarial scene of {config.add} is not kept: {suite_run.results[0].reason}")
-        return keep_result(run, suite_run.result(ending, passed(), added))
+        return keep_result(run, suite_run.result(ending, added))
 
 
 @dataclass
 class _SuiteRun:
     """A suite on its way."""
 
-    config: SuiteConfig
-    suite: Suite
-    planned: Sequence[PlannedClaim]
     trial: Trial
+    planned: Sequence[PlannedClaim]
     expected: Mapping[str, str]
-
-    def __post_init__(self) -> None:
-        self.results: list[ClaimResult] = []
+    results: list[ClaimResult] = field(default_factory=list)
 
     def carry_out(self) -> str:
-        """Try what is planned, and return how it ended."""
-        results, begun = Results(self.trial.run), time.perf_counter()
+        trial, stored = self.trial, Results(self.trial.run)
         try:
             with interruptible():
                 for number, claim in enumerate(self.planned, start=1):
-                    self._add(claim, self._tried(claim, results))
-                    self.trial.progress.message(f"{claim.name}: {self.results[-1].answer}: {self.results[-1].reason}")
+                    self._add(claim, self._tried(claim, stored))
+                    trial.progress.message(f"{claim.name}: {self.results[-1].answer}: {self.results[-1].reason}")
                     if number < len(self.planned):
-                        seconds = time.perf_counter() - begun
-                        self.trial.run.write_summary(self.result(INTERRUPTED, seconds, None))  # what a kill leaves
+                        trial.run.write_summary(self.result(INTERRUPTED, None))  # what a kill leaves
         except KeyboardInterrupt:
             for claim in self.planned[len(self.results) :]:
                 self._add(claim, self._not_tried(claim, STOPPED))
             return INTERRUPTED
         if any(tried.reason == NOT_TRIED for tried in self.results):
-            self.trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
+            trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
         return OUT_OF_TIME if any(TIME_OVER in tried.reason for tried in self.results) else "done"
 
     def _tried(self, claim: PlannedClaim, results: Results) -> ClaimResult:
-        """What a claim says; what is decided, or has used its pictures, is stored."""
-        key = f"claim {claim.name}"
+        key, trial = f"claim {claim.name}", self.trial
         if (stored := results.stored(key)) is not None:
             return ClaimResult.of(stored)
         failed = any(known.kind == "counterexample" and not known.accepted for known in self.results)
-        if failed and claim.example is None and not self.config.all:
+        if failed and claim.example is None and not trial.config.all:
             return self._not_tried(claim, NOT_TRIED)
-        if self.trial.late():
+        if trial.late:
             return self._not_tried(claim, f"{TIME_OVER} before it began")
         asked, begun = self._not_tried(claim, ""), time.perf_counter()
         if claim.example is None:
-            tried = self.trial.claim(asked, self.suite.claims[claim.name], claim.config)
+            tried = trial.claim(asked, trial.suite.claims[claim.name], claim.config)
         else:
             assert isinstance(claim.config, AttackConfig)
-            added = self.config.add is not None
-            tried = self.trial.counterexample(asked, claim.example, claim.config, added=added)
+            tried = trial.counterexample(asked, claim.example, claim.config)
         if tried.reason == STOPPED:
             raise KeyboardInterrupt
         tried = tried.model_copy(update={"seconds": time.perf_counter() - begun})
@@ -150,7 +133,7 @@ class _SuiteRun:
         return tried
 
     def _not_tried(self, claim: PlannedClaim, reason: str) -> ClaimResult:
-        text = room.statement(self.suite.claims[claim.name], claim.config) if claim.example is None else ""
+        text = room.statement(self.trial.suite.claims[claim.name], claim.config) if claim.example is None else ""
         return ClaimResult(name=claim.name, kind=claim.kind, statement=text, answer=room.UNDECIDED, reason=reason)
 
     def _add(self, claim: PlannedClaim, tried: ClaimResult) -> None:
@@ -160,26 +143,27 @@ class _SuiteRun:
         self.results.append(tried.model_copy(update={"expected": expected, "repeat": repeat}))
 
     def _repeat(self, **changes: object) -> str:
-        asked = self.config.model_copy(update={"seed": self.suite.seed, "fresh": False, **changes})
-        return asked.with_only_here(self.config.only_here).command_line()
+        config = self.trial.config
+        asked = config.model_copy(update={"seed": self.trial.suite.seed, "fresh": False, **changes})
+        return asked.with_only_here(config.only_here).command_line()
 
-    def result(self, ending: str, seconds: float, added: Counterexample | None) -> SuiteResult:
-        """Return what the claims so far come to."""
+    def result(self, ending: str, added: Counterexample | None) -> SuiteResult:
+        config, suite = self.trial.config, self.trial.suite
         configs, changes = [claim.config for claim in self.planned], list[str]()
         results = [*self.results, *(self._not_tried(claim, NOT_YET) for claim in self.planned[len(self.results) :])]
-        if self.config.update and ending == "done":
+        if config.update and ending == "done":
             now = {tried.name: tried.answer for tried in results if NOT_TRIED not in tried.reason}
-            changes = beside.write_expected(self.config.suite, now)
+            changes = beside.write_expected(config.suite, now)
             results = [tried.model_copy(update={"expected": now.get(tried.name, tried.expected)}) for tried in results]
         return SuiteResult(
-            run=str(self.trial.run.path), suite=self.config.suite, title=self.suite.title,
+            run=str(self.trial.run.path), suite=config.suite, title=suite.title,
             object=",".join(dict.fromkeys(config.object for config in configs)),
             model=",".join(dict.fromkeys(config.model for config in configs)),
             environment=",".join(dict.fromkeys(config.lit_by for config in configs)),
             controls=list(dict.fromkeys(name for config in configs for name in config.controls)),
-            answer=room.verdict(results), confidence=self.suite.confidence, claims=results, ending=ending,
+            answer=room.verdict(results), confidence=suite.confidence, claims=results, ending=ending,
             added=None if added is None else str(added.path), changes=changes,
-            warnings=list(dict.fromkeys(self.trial.warnings)), seconds={"total": seconds}, seed=self.suite.seed,
+            warnings=list(dict.fromkeys(self.trial.warnings)), seconds={"total": self.trial.passed}, seed=suite.seed,
             command_line=self._repeat(),
         )  # fmt: skip
 
@@ -213,35 +197,27 @@ def _check(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
     """Load everything that claims name, and refuse what could not be judged or decided; a wrong name would end minutes
     of rendering. Return what has to be said before."""
     known = list[AttackConfig]()
-    own = [each for each in planned if each.example is None]
+    own = [(each, suite.claims[each.name]) for each in planned if each.example is None]
     # what is beside the suite is loaded when it is tried, at once
-    remarks = [check_pictures(each.name, suite.claims[each.name], suite.confidence) for each in own]
-    for each in own:
-        claim = suite.claims[each.name]
-        if isinstance(claim, NotBrokenClaim):
-            _check_search(each.name, each.config)
-        wanted = [each.config if isinstance(each.config, AttackConfig) else AttackConfig.of(each.config)]
-        if isinstance(claim, NoWorseClaim):
-            wanted.append(wanted[0].model_copy(update={"model": claim.than}))
-        for config in wanted:
-            if config not in known:
+    remarks = [check_pictures(each.name, claim, suite.confidence) for each, claim in own]
+    for each, claim in own:
+        config = each.config if isinstance(each.config, AttackConfig) else AttackConfig.of(each.config)
+        for setting, wrong, why in (
+            ("object", len(config.objects) > 1, "one object; make a claim of each"),
+            ("epsilon", len(config.epsilons) > 1, "one epsilon; make a claim of each"),
+            ("model", config.is_study, "one model; make a claim of each"),
+            ("smallest", config.smallest, "a budget, which the claim is about; leave it out"),
+            ("minimise", config.minimise, "a search that makes the model wrong; leave it out"),
+            ("target", config.target is not None, "any wrong prediction; leave it out"),
+        ):
+            if wrong and isinstance(claim, NotBrokenClaim):
+                raise InputError(f"claims.{each.name}.settings: {setting}: expected {why}")
+        than = [config.model_copy(update={"model": claim.than})] if isinstance(claim, NoWorseClaim) else []
+        for wanted in (config, *than):
+            if wanted not in known:
                 try:
-                    check_from_config(config)
+                    check_from_config(wanted)
                 except InputError as error:
                     raise InputError(f"claims.{each.name}: {error}") from None
-                known.append(config)
+                known.append(wanted)
     return [remark for remark in remarks if remark]
-
-
-def _check_search(name: str, config: SceneConfig) -> None:
-    assert isinstance(config, AttackConfig)
-    for setting, wrong, why in (
-        ("object", len(config.objects) > 1, "one object; make a claim of each"),
-        ("epsilon", len(config.epsilons) > 1, "one epsilon; make a claim of each"),
-        ("model", config.is_study, "one model; make a claim of each"),
-        ("smallest", config.smallest, "a budget, which the claim is about; leave it out"),
-        ("minimise", config.minimise, "a search that makes the model wrong; leave it out"),
-        ("target", config.target is not None, "any wrong prediction; leave it out"),
-    ):
-        if wrong:
-            raise InputError(f"claims.{name}.settings: {setting}: expected {why}")

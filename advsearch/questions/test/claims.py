@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
-from itertools import islice
+from itertools import islice, repeat
 from typing import Any
 
 import torch
 from torch import Tensor
 
 import advsearch.questions.test.result as words
+import advsearch.questions.test.settings as suites
 from advsearch import seeds
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
@@ -25,172 +27,52 @@ from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
-from advsearch.questions.attack.carry_out import executor_for, parts_of, problem_of
+from advsearch.questions.attack.carry_out import executor_for, parts_of, problem_on
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, scene_digest
 from advsearch.questions.test.result import FAILED, HELD, TIME_OVER, UNDECIDED, ClaimResult
-from advsearch.questions.test.settings import AnyClaim, ChangeClaim, DrawnConfig, NoWorseClaim, RightClaim, ShareClaim
+from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim, ShareClaim
 from advsearch.report.wording import number_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.settings import split_names
 
 MANY = 4  # values of a configuration that are said in words, at most
-
 MOST_KEPT = 64  # of a configuration with more numbers, a picture's row does not hold the values
-
 AHEAD = 2  # pictures that are asked for at once, for each worker
+ATTACK_WORKER = "advsearch.questions.attack.carry_out:attack_worker"
 
 
 @dataclass
 class Trial:
-    """What claims are tried with: `confidence` is of each that pictures decide, `late` whether the time of the suite is
-    over and `left` the seconds until then, infinite without a limit; `warnings` gets what a reader has to know."""
+    """What claims are tried with, since `begun` by the clock; `warnings` gets what a reader has to know."""
 
     run: RunDirectory
-    confidence: float
-    late: Callable[[], bool]
-    left: Callable[[], float]
-    workers: int | None
-    cluster: str | None
+    config: suites.SuiteConfig
+    suite: suites.Suite
+    begun: float
     progress: Progress
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[str]
+
+    @property
+    def passed(self) -> float:
+        return time.perf_counter() - self.begun
+
+    @property
+    def seconds(self) -> float:
+        return self.config.seconds or self.suite.seconds or math.inf
+
+    @property
+    def late(self) -> bool:
+        return self.passed >= self.seconds
 
     def claim(self, asked: ClaimResult, claim: AnyClaim, config: SceneConfig) -> ClaimResult:
-        """Try a claim that is asked and undecided; what was asked before is read back."""
-        if isinstance(claim, RightClaim):
-            return self._right(asked, claim, config)
-        if isinstance(claim, NoWorseClaim):
-            return self._no_worse(asked, claim, config)
-        if isinstance(claim, ChangeClaim):
-            return self._changes(asked, claim, config)
+        if isinstance(claim, ShareClaim | NoWorseClaim):
+            return self._by_pictures(asked, claim, config)
         assert isinstance(config, AttackConfig)
-        return self._not_broken(asked, config)
-
-    def _right(self, asked: ClaimResult, claim: RightClaim, config: SceneConfig) -> ClaimResult:
-        problem, shared = self._problem(config), self._shared(config)
-        sequence, right, hidden, verdict = ConfidenceSequence(self.confidence, sides=1), 0, 0, UNDECIDED
-        wrong: tuple[float, Query, str] | None = None
-        self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
-        with executor_for(shared, "advsearch.questions.attack.carry_out:attack_worker", self.progress) as executor:
-            journal = Journal(self.run, Shared(problem, executor))
-            queries = drawn(problem, f"claim {asked.name}", claim.pictures, spp_of(config))
-            for query, evaluation in self._evaluations(journal, queries):
-                judged = evaluation.said
-                if judged.prediction.label == OUT_OF_VIEW:
-                    hidden += 1
-                    continue
-                sequence.add(float(judged.right))
-                right += judged.right
-                score = judged.score if math.isfinite(judged.score) else -math.inf
-                if not judged.right and (wrong is None or score > wrong[0]):
-                    wrong = score, query, judged.prediction.label
-                verdict = decided(sequence, least_mean(claim))
-                if verdict != UNDECIDED:
-                    break
-        worst, picture = "", None
-        if wrong is not None:
-            _, query, label = wrong
-            worst = f"most wrong where it says {label}: {self._described(problem, query)}"
-            picture = self._picture(asked.name, problem, query)
-        reason = words.share_reason("right", verdict, right, sequence.count, sequence.interval, worst)
-        reason += f"; the object is not to be seen in {hidden} more, which are not counted" if hidden else ""
-        return self._decided(asked, verdict, reason, sequence, config, picture)
-
-    def _no_worse(self, asked: ClaimResult, claim: NoWorseClaim, config: SceneConfig) -> ClaimResult:
-        problem, other = self._problem(config), self._problem(config.model_copy(update={"model": claim.than}))
-        same = other.renderer.formation == problem.renderer.formation
-        sequence, ours, theirs, verdict = ConfidenceSequence(self.confidence, sides=1), 0, 0, UNDECIDED
-        first = None
-        shared = self._shared(config).model_copy(update={"model": f"{config.model},{claim.than}"})
-        with executor_for(shared, "advsearch.questions.test.claims:claim_worker", self.progress) as executor:
-            journal = Journal(self.run, Shared(problem, executor, "0"))
-            beside = Journal(self.run, Shared(other, executor, "1"))
-            shown = (lambda _, picture: picture.clone()) if same else None
-            for query, own, its in self._pairs(asked, claim, config, journal, beside, shown):
-                ours += own.said.right and not its.said.right
-                theirs += its.said.right and not own.said.right
-                if first is None and its.said.right and not own.said.right:
-                    first = query
-                sequence.add((own.said.right - its.said.right + 1) / 2)
-                verdict = decided(sequence, least_mean(claim))
-                if verdict != UNDECIDED:
-                    break
-        low, high = sequence.interval
-        counts = (sequence.count, ours, theirs)
-        reason = words.difference_reason(verdict, counts, (2 * low - 1, 2 * high - 1), claim.than)
-        picture = None if first is None else self._picture(asked.name, problem, first)
-        return self._decided(asked, verdict, reason, sequence, config, picture, (-1.0, 2.0))
-
-    def _changes(self, asked: ClaimResult, claim: ChangeClaim, config: SceneConfig) -> ClaimResult:
-        """Whether a change of the picture changes what the model says, or not."""
-        problem = self._problem(config)
-        other = self._problem(config) if claim.when == AWAY else problem
-        other.renderer.scene.assembly.away = claim.when == AWAY
-        sequence, held, example, verdict = ConfidenceSequence(self.confidence, sides=1), 0, "", UNDECIDED
-        picture = None
-        shared = self._shared(config)
-        with executor_for(shared, "advsearch.questions.attack.carry_out:attack_worker", self.progress) as executor:
-            journal, beside = Journal(self.run, Shared(problem, executor)), Journal(self.run, Shared(problem))
-
-            def shown(query: Query, picture: Tensor) -> Tensor:  # judged by what was true before it was changed
-                if claim.when == AWAY:
-                    return other.picture(query.u, query.seed, query.spp)
-                return changed(picture, claim.when, problem.model.cameras)
-
-            for query, own, its in self._pairs(asked, claim, config, journal, beside, shown):
-                before, after = own.said.prediction, its.said.prediction
-                right = as_claimed(claim.claim, before, after)
-                held += right
-                if not right and picture is None:
-                    example = f"{before.label} before and {after.label} after: {self._described(problem, query)}"
-                    picture = self._picture(asked.name, problem, query)
-                sequence.add(float(right))
-                verdict = decided(sequence, least_mean(claim))
-                if verdict != UNDECIDED:
-                    break
-        reason = words.share_reason("as claimed", verdict, held, sequence.count, sequence.interval, example)
-        return self._decided(asked, verdict, reason, sequence, config, picture)
-
-    def _pairs(
-        self, asked: ClaimResult, claim: NoWorseClaim | ChangeClaim, config: SceneConfig, journal: Journal,
-        beside: Journal, shown: Callable[[Query, Tensor], Tensor] | None,
-    ) -> Iterator[tuple[Query, Evaluation, Evaluation]]:  # fmt: skip
-        """Yield a claim's pictures, what is said of each, and what the other side says of what is `shown` to it of this
-        picture; without, of a picture of its own."""
-        kind = f"claim {asked.name}"
-        self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
-        problem, other = journal.traced.problem, beside.traced.problem
-        pictures: dict[int, Tensor | None] = {}
-
-        def here(queries: Sequence[Query]) -> Iterator[Evaluation]:
-            evaluations = journal.traced([replace(query, keep=shown is not None) for query in queries])
-            for query, evaluation in zip(queries, evaluations, strict=True):
-                pictures[query.number] = evaluation.picture
-                yield evaluation
-
-        def there(queries: Sequence[Query]) -> Iterable[Evaluation]:
-            if shown is None:
-                yield from beside.traced(queries)
-                return
-            for query in queries:
-                picture = pictures.get(query.number)  # what was asked before is read back, without its picture
-                if picture is None:
-                    picture = problem.picture(query.u, query.seed, query.spp)
-                yield other.trial(shown(query, picture), other.whole(query.u))
-
-        for batch in self._batches(journal, drawn(problem, kind, claim.pictures, spp_of(config))):
-            pictures.clear()
-            mine = list(journal.evaluate_all(batch, here))
-            both = beside.evaluate_all([replace(query, kind=f"{kind} beside") for query in batch], there)
-            for query, own, its in zip(batch, mine, both, strict=True):
-                self.progress.advance(1, **journal.traced.told)
-                yield query, own, its
-
-    def _not_broken(self, asked: ClaimResult, config: AttackConfig) -> ClaimResult:
-        seconds = min(self.left(), config.seconds or math.inf)
-        shared = {"workers": self.workers, "cluster": self.cluster}
+        seconds = min(max(0.001, self.seconds - self.passed), config.seconds or math.inf)
+        shared = {"workers": self.config.workers, "cluster": self.config.cluster}
         limited = {**shared, "seconds": seconds if math.isfinite(seconds) else None}
         own = config.model_copy(update=limited).with_only_here(config.only_here)
         summary = carry_out_part(self.run.path / PARTS / asked.name, own, self.progress)
@@ -204,24 +86,123 @@ class Trial:
         outcome["picture"] = file if verdict == FAILED and (self.run.path / file).is_file() else None
         return asked.model_copy(update=outcome)
 
-    def counterexample(
-        self, asked: ClaimResult, example: Counterexample, config: AttackConfig, *, added: bool = False
-    ) -> ClaimResult:
-        """Try a counterexample: the model should be right on it. Trials by which it is `added` are no trials of it."""
+    def _by_pictures(self, asked: ClaimResult, claim: ShareClaim | NoWorseClaim, config: SceneConfig) -> ClaimResult:
+        """Draw pictures until they decide: of the model alone, beside another model, or beside what it says of the same
+        pictures changed."""
+        problem, kind, spp = self._problem(config), f"claim {asked.name}", spp_of(config)
+        shared = AttackConfig.of(config, workers=self.config.workers, cluster=self.config.cluster)
+        worker, name, other, other_name = ATTACK_WORKER, "", problem, None
+        shown: Callable[[Query, Tensor], Tensor] | None = None  # to the other side; without, a picture of its own
+        if isinstance(claim, NoWorseClaim):
+            other = self._problem(config.model_copy(update={"model": claim.than}))
+            worker, name, other_name = "advsearch.questions.test.claims:claim_worker", "0", "1"
+            shared = shared.model_copy(update={"model": f"{config.model},{claim.than}"})
+            if other.renderer.formation == problem.renderer.formation:
+                shown = lambda _, picture: picture.clone()  # noqa: E731
+        elif isinstance(claim, ChangeClaim):  # judged by what was true before it was changed
+            shown = self._changed(claim, config, problem)
+        sequence, least = ConfidenceSequence(self.suite.confidence, sides=1), least_mean(claim)
+        values, hidden, verdict = list[float](), 0, UNDECIDED
+        worst: tuple[float, Query, str] | None = None
+        self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
+        with executor_for(shared, worker, self.progress) as executor:
+            journal, beside = Journal(self.run, Shared(problem, executor, name)), None
+            if not isinstance(claim, RightClaim):
+                there = Shared(other) if other_name is None else Shared(other, executor, other_name)
+                beside = Journal(self.run, there)
+            queries = drawn(problem, kind, claim.pictures, spp)
+            for query, own, its in self._pairs(journal, queries, beside, shown):
+                value, badness, text = valued(claim, own, its)
+                if value is None:
+                    hidden += 1
+                    continue
+                sequence.add(value)
+                values.append(value)
+                if value == 0.0 and (worst is None or badness > worst[0]):
+                    worst = badness, query, text
+                verdict = HELD if sequence.is_over(least) else FAILED if sequence.is_under(least) else UNDECIDED
+                if verdict != UNDECIDED:
+                    break
+        example, interval, mean = "", sequence.interval, sequence.mean
+        if worst is not None:
+            example = f"{worst[2]}: {self._described(problem, worst[1])}"
+        if isinstance(claim, NoWorseClaim):  # a mean of 1/2 is no difference
+            interval, mean = (2.0 * interval[0] - 1.0, 2.0 * interval[1] - 1.0), 2.0 * mean - 1.0
+            counts = (len(values), values.count(1.0), values.count(0.0))
+            reason = words.difference_reason(verdict, counts, interval, claim.than)
+        else:
+            what = "right" if isinstance(claim, RightClaim) else "as claimed"
+            reason = words.share_reason(what, verdict, values.count(1.0), len(values), interval, example)
+        reason += f"; the object is not to be seen in {hidden} more, which are not counted" if hidden else ""
+        reason += f"; {TIME_OVER}" if verdict == UNDECIDED and self.late else ""
+        outcome = {"answer": verdict, "reason": reason, "pictures": len(values), "spp": spp, "interval": interval}
+        outcome["rate"] = mean if values else None
+        outcome["picture"] = self._picture(asked.name, problem, worst[1]) if worst else None
+        return asked.model_copy(update=outcome)
+
+    def _changed(self, claim: ChangeClaim, config: SceneConfig, problem: Problem) -> Callable[[Query, Tensor], Tensor]:
+        if claim.when != AWAY:
+            return lambda query, picture: changed(picture, claim.when, problem.model.cameras)
+        other = self._problem(config)
+        other.renderer.scene.assembly.away = True
+        return lambda query, picture: other.picture(query.u, query.seed, query.spp)
+
+    def _pairs(
+        self, journal: Journal, queries: Iterator[Query], beside: Journal | None = None,
+        shown: Callable[[Query, Tensor], Tensor] | None = None,
+    ) -> Iterator[tuple[Query, Evaluation, Evaluation | None]]:  # fmt: skip
+        """Yield queries, as many at once as there are workers for, until the time is over; with what is said of each,
+        and what the other side says of what is `shown` to it of this picture; without, of a picture of its own."""
+        pictures: dict[int, Tensor | None] = {}
+
+        def here(queries: Sequence[Query]) -> Iterator[Evaluation]:
+            evaluations = journal.traced([replace(query, keep=shown is not None) for query in queries])
+            for query, evaluation in zip(queries, evaluations, strict=True):
+                pictures[query.number] = evaluation.picture
+                yield evaluation
+
+        def there(queries: Sequence[Query]) -> Iterable[Evaluation]:
+            assert beside is not None
+            if shown is None:
+                yield from beside.traced(queries)
+                return
+            problem, other = journal.traced.problem, beside.traced.problem
+            for query in queries:
+                picture = pictures.get(query.number)  # what was asked before is read back, without its picture
+                if picture is None:
+                    picture = problem.picture(query.u, query.seed, query.spp)
+                yield other.trial(shown(query, picture), other.whole(query.u))
+
+        at_once = 1 if journal.traced.executor is None else AHEAD * (self.config.workers or 8)
+        while batch := list(islice(queries, at_once)):
+            pictures.clear()
+            mine: Iterable[Evaluation] = journal.evaluate_all(batch, here)
+            its: Iterable[Evaluation | None] = repeat(None)
+            if beside is not None:
+                mine = list(mine)
+                its = beside.evaluate_all([replace(query, kind=f"{query.kind} beside") for query in batch], there)
+            for query, own, other in zip(batch, mine, its, strict=False):
+                self.progress.advance(1, **journal.traced.told)
+                yield query, own, other
+            if self.late:
+                return
+
+    def counterexample(self, asked: ClaimResult, example: Counterexample, config: AttackConfig) -> ClaimResult:
+        """Try a counterexample: the model should be right on it. Trials by which it is added are no trials of it."""
         asked = asked.model_copy(update={"statement": f"{config.model} is right where it said {example.said}"})
         parts = parts_of(config)
         if scene_digest(parts.scene) != example.scene:
             reason = "its scene is another one now; remove it, or add the adversarial scene of a new run"
             return asked.model_copy(update={"reason": reason})
-        problem = problem_of(config, parts.scene, parts.loaded[0], differentiated=False)
+        problem = problem_on(parts, differentiated=False)
         u = problem.domain.project(example.configuration(problem.domain.start))
         count, tried, right, label, picture = TRIALS[is_over(config)], 0, 0, "", None
         self.progress.stage(example.name, count, at_most=True)
-        kind = f"{'added ' if added else ''}counterexample {example.name}"
+        kind = f"{'added ' if self.config.add is not None else ''}counterexample {example.name}"
         queries = (
             Query(u, seeds.stream(problem.seed, kind, number), kind, number, spp=example.spp) for number in range(count)
         )
-        for query, evaluation in self._evaluations(Journal(self.run, Shared(problem)), queries):
+        for query, evaluation, _ in self._pairs(Journal(self.run, Shared(problem)), queries):
             tried, right = tried + 1, right + evaluation.said.right
             if not evaluation.said.right and not label:
                 label, picture = evaluation.said.prediction.label, self._picture(example.name, problem, query)
@@ -236,28 +217,11 @@ class Trial:
         return asked.model_copy(update=outcome)
 
     def _problem(self, config: SceneConfig) -> Problem:
-        whole = AttackConfig.of(config)
-        parts = parts_of(whole)
-        problem = problem_of(whole, parts.scene, parts.loaded[0], differentiated=False)
-        self.warnings += [*problem.space.notes(parts.scene.description), *parts.loaded[1]]
+        parts = parts_of(AttackConfig.of(config))
+        remarks = [*parts.loaded[1]]  # without those of the task, which stand in the reason
+        problem = problem_on(parts, differentiated=False)
+        self.warnings += [*problem.space.notes(parts.scene.description), *remarks]
         return problem
-
-    def _shared(self, config: SceneConfig) -> AttackConfig:
-        return AttackConfig.of(config, workers=self.workers, cluster=self.cluster)
-
-    def _evaluations(self, journal: Journal, queries: Iterator[Query]) -> Iterator[tuple[Query, Evaluation]]:
-        for batch in self._batches(journal, queries):
-            for query, evaluation in zip(batch, journal.evaluate_all(batch), strict=True):
-                self.progress.advance(1, **journal.traced.told)
-                yield query, evaluation
-
-    def _batches(self, journal: Journal, queries: Iterator[Query]) -> Iterator[list[Query]]:
-        """As many at once as there are workers for, until the time is over."""
-        at_once = 1 if journal.traced.executor is None else AHEAD * (self.workers or 8)
-        while batch := list(islice(queries, at_once)):
-            yield batch
-            if self.late():
-                return
 
     def _picture(self, name: str, problem: Problem, query: Query) -> str:
         self.run.save_image(name, problem.picture(query.u, query.seed, query.spp, drawn=query.drawn))
@@ -271,28 +235,12 @@ class Trial:
             shown.append(f"{name} {number_text(value['value'])}{unit}")
         return ", ".join([*shown, *(["..."] if len(values) > MANY else [])])
 
-    def _decided(
-        self, asked: ClaimResult, verdict: str, reason: str, sequence: ConfidenceSequence, config: SceneConfig,
-        picture: str | None, scale: tuple[float, float] = (0.0, 1.0),
-    ) -> ClaimResult:  # fmt: skip
-        """What drawn pictures say; `scale` has the value of a mean of 0, and how much more that of 1 is."""
-        begin, wide = scale
-        low, high = sequence.interval
-        late = f"; {TIME_OVER}" if verdict == UNDECIDED and self.late() else ""
-        outcome = {"answer": verdict, "reason": reason + late, "pictures": sequence.count, "picture": picture}
-        outcome["rate"] = begin + wide * sequence.mean if sequence.count else None
-        outcome |= {"interval": (begin + wide * low, begin + wide * high), "spp": spp_of(config)}
-        return asked.model_copy(update=outcome)
-
 
 def claim_worker(settings: JsonObject) -> Callable[[Any], Any]:
-    """Return what evaluates the queries of a claim about two models, named by their place: what a worker does."""
     models = split_names(str(settings["model"]))
 
     def problem(name: str) -> Problem:
-        config = AttackConfig(**{**settings, "model": models[int(name)]})
-        parts = parts_of(config)
-        return problem_of(config, parts.scene, parts.loaded[0], differentiated=False)
+        return problem_on(parts_of(AttackConfig(**{**settings, "model": models[int(name)]})), differentiated=False)
 
     return worker_call(cache(problem))
 
@@ -332,12 +280,24 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     )
 
 
-def decided(sequence: ConfidenceSequence, least: float) -> str:
-    """Return what draws say of the claim that their mean is at least so large."""
-    return HELD if sequence.is_over(least) else FAILED if sequence.is_under(least) else UNDECIDED
+def valued(
+    claim: ShareClaim | NoWorseClaim, own: Evaluation, its: Evaluation | None
+) -> tuple[float | None, float, str]:
+    """Return what a picture says for a claim, from 0 to 1, or None where the object is not to be seen; how bad an
+    example it is of what is against it, and which."""
+    before = own.said.prediction
+    if before.label == OUT_OF_VIEW:
+        return None, 0.0, ""
+    if its is None:
+        badness = own.said.score if math.isfinite(own.said.score) else -math.inf
+        return float(own.said.right), badness, f"most wrong where it says {before.label}"
+    if isinstance(claim, ChangeClaim):
+        after = its.said.prediction
+        text = f"{before.label} before and {after.label} after"
+        return float(as_claimed(claim.claim, before, after)), 0.0, text
+    return (own.said.right - its.said.right + 1) / 2, 0.0, ""
 
 
 def spp_of(config: SceneConfig) -> int:
-    """Return the samples a pixel of each picture."""
-    assert isinstance(config, DrawnConfig)
+    assert isinstance(config, suites.DrawnConfig)
     return ladder_of(AttackConfig.of(config, verify_spp=config.verify_spp))[0]

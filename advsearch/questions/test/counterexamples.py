@@ -21,7 +21,6 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.config import SceneConfig
 from advsearch.engine.loading import Scene
-from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import parse_json, read_text
@@ -48,7 +47,6 @@ side of the squares of texels that have one."""
 PICTURE = ".jpg"  # how the name of the picture ends
 LARGEST = 1 << 24  # most bytes of a file, and most numbers of a configuration
 MEMORY = 1 << 27  # bytes that unpacking one may take
-
 TRIALS = {False: 6, True: 20}  # fresh renders that try one, and one that has to hold under many conditions
 
 OF_SEARCH = (
@@ -81,7 +79,10 @@ class _Block(BaseModel):
             squares = moved.reshape(side // square, square, side // square, square, 3)
             moved = squares.mean(axis=(1, 3)).ravel()
         steps = np.round(moved / (step or 1.0)).astype("<i2")
-        data = steps.tobytes() if few or not signs else _three_in_one(steps)
+        data = steps.tobytes()
+        if signs and not few:  # three numbers from -1 to 1 in each byte
+            threes = np.pad(steps, (0, -len(steps) % 3)).reshape(-1, 3) @ (9, 3, 1) + 13
+            data = threes.astype(np.uint8).tobytes()
         packed = base64.b85encode(lzma.compress(data, lzma.FORMAT_ALONE)).decode("ascii")
         numbers = len(moved) * square**2
         return cls(numbers=numbers, step=step or 1.0, signs=not few and signs, square=square, offsets=packed)
@@ -91,26 +92,17 @@ class _Block(BaseModel):
         size, side = self.numbers // self.square**2, isqrt(self.numbers // 3)
         unpack = lzma.LZMADecompressor(memlimit=MEMORY)
         data = unpack.decompress(base64.b85decode(self.offsets), 2 * size + 1)
-        bytes_ = np.frombuffer(data, np.uint8)
         if len(data) != (-(-size // 3) if self.signs else 2 * size):
             raise ValueError(f"expected {size} numbers, got others")
-        steps = _one_by_one(bytes_)[:size] if self.signs else np.frombuffer(data, "<i2")
+        steps = np.frombuffer(data, np.uint8 if self.signs else "<i2")
+        if self.signs:
+            threes = np.stack([steps // 9, steps // 3 % 3, steps % 3], axis=1).astype(np.int16)
+            steps = (threes - 1).ravel()[:size]
         if self.square > 1:
             squares = steps.reshape(side // self.square, side // self.square, 3)
             steps = squares.repeat(self.square, axis=0).repeat(self.square, axis=1).ravel()
         moved: Floats = steps.astype(np.float32) * np.float32(self.step)
         return moved
-
-
-def _three_in_one(steps: np.ndarray[Any, np.dtype[np.int16]]) -> bytes:
-    """Three numbers from -1 to 1 in each byte."""
-    threes = np.pad(steps, (0, -len(steps) % 3)).reshape(-1, 3) @ (9, 3, 1) + 13
-    return threes.astype(np.uint8).tobytes()
-
-
-def _one_by_one(data: np.ndarray[Any, np.dtype[np.uint8]]) -> np.ndarray[Any, np.dtype[np.int16]]:
-    """What `_three_in_one` has put together."""
-    return (np.stack([data // 9, data // 3 % 3, data % 3], axis=1).astype(np.int16) - 1).ravel()
 
 
 class _File(BaseModel):
@@ -139,7 +131,6 @@ class Counterexample:
     moved: Floats
 
     def config_for(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
-        """Return what it is tried with: the run's scene, and the suite's model."""
         of_suite = {name: value for name, value in suite.settings.items() if name in OF_MODEL}
         changed = {name: value for name, value in changes.items() if value is not None}
         plain = {**self.config.plain(), "run": None}
@@ -148,7 +139,6 @@ class Counterexample:
         return AttackConfig(**{**plain, **of_suite, "seed": suite.seed, **changed})
 
     def configuration(self, start: Tensor) -> Tensor:
-        """Return u, (d,) float32, from that of the clean scene."""
         if start.numel() != len(self.moved):
             raise InputError(
                 f"{self.path}: has {len(self.moved)} numbers, and its scene has {start.numel()} now; remove it, or "
@@ -158,12 +148,10 @@ class Counterexample:
 
 
 def folder_of(suite: str) -> Path:
-    """Return the folder of a suite's counterexamples, and of what is expected of it."""
     return Path(suite).with_suffix(".counterexamples")
 
 
 def scene_digest(scene: Scene) -> str:
-    """Return the SHA-256 of object, environment and given values, in hexadecimal."""
     described, digest = scene.description, hashlib.sha256()
     mesh, light = described.object.mesh, described.environment
     for array in (mesh.vertices, mesh.faces, mesh.uvs, described.object.base_color, light.radiance if light else None):
@@ -202,30 +190,26 @@ def add(suite: str, run: str) -> Counterexample:
     write_bytes(folder / f"{name}{PICTURE}", thumbnail(read_png(path / IMAGES / "adversarial.png")))
     blocks = [block.size for block in problem.domain.blocks]
     forms = FORMS if max(blocks) > FEW else FORMS[-1:]
+    trials = 2 * TRIALS[is_over(config)]  # twice as many as will try it
     for form in forms:
         parted = [_Block.of(part, *form) for part in np.split(moved, np.cumsum(blocks)[:-1])]
         text = json.dumps({**values, "blocks": [block.model_dump() for block in parted]}, indent=1)
         example = _read(write_text(folder / f"{name}.json", text + "\n"))
-        if form == forms[-1] or _is_wrong(problem, example):
-            break
+        u = problem.domain.project(example.configuration(problem.domain.start))
+        fresh = (seeds.stream(problem.seed, "kept", number) for number in range(trials))
+        if form == forms[-1] or not any(
+            problem.judge(problem.picture(u, seed, example.spp), problem.whole(u, seed)).right for seed in fresh
+        ):
+            break  # the run's model is wrong on what is kept
     return example
 
 
-def _is_wrong(problem: Problem, example: Counterexample) -> bool:
-    """Whether the run's model is wrong on what is kept, in twice as many trials as will try it."""
-    u, trials = problem.domain.project(example.configuration(problem.domain.start)), TRIALS[is_over(example.config)]
-    fresh = (seeds.stream(problem.seed, "kept", number) for number in range(2 * trials))
-    return not any(problem.judge(problem.picture(u, seed, example.spp), problem.whole(u, seed)).right for seed in fresh)
-
-
 def remove(example: Counterexample) -> None:
-    """Remove the files of a counterexample."""
     example.path.unlink(missing_ok=True)
     example.path.with_suffix(PICTURE).unlink(missing_ok=True)
 
 
 def counterexamples(suite: str) -> list[Counterexample]:
-    """Return those of a suite, by name; a FileFormatError where one is damaged."""
     folder = folder_of(suite)
     return [_read(path) for path in sorted(folder.glob("*.json")) if path.name != EXPECTED]
 
@@ -278,5 +262,4 @@ def write_expected(suite: str, verdicts: Mapping[str, str]) -> list[str]:
 
 
 def is_over(config: SceneConfig) -> bool:
-    """Whether a scene has to hold under many conditions."""
     return bool(getattr(config, "over", {}))

@@ -20,11 +20,10 @@ from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim
 from advsearch.report.shown import Claim, InNotebook, Kind, Picture, ResultPart, ShownResult
 from advsearch.report.wording import count, interval_text, number_text, percent, seconds_text, short_name, with_article
-from advsearch.runs.results import INTERRUPTED, RUNNING, Fields, Interval, JsonFloat, RunResult
+from advsearch.runs.results import INTERRUPTED, RUNNING, Fields, Interval, JsonFloat, RunResult, optional
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"
 VERDICTS = (HELD, UNDECIDED, FAILED)  # from the best to the worst
-
 STATUS = {HELD: 0, FAILED: 1, UNDECIDED: 2}  # exit status of the command, by what the suite says as a whole
 
 
@@ -40,25 +39,21 @@ class ClaimResult(Fields):
     reason: str = Field(description="why, with the numbers")
     expected: str = Field(HELD, description="what it said when `update` was given last; absent for `held`")
     pictures: int = Field(0, description="that it took; absent if none")
-    rate: JsonFloat | None = Field(
-        None,
-        description="share of right predictions, or of pictures as claimed; of two models the difference; absent of "
-        "a search",
+    rate: JsonFloat | None = optional(
+        "share of right predictions, or of pictures as claimed; of two models the difference; absent of a search"
     )
-    interval: Interval | None = Field(
-        None,
-        description="of it: each end holds at all times together, at the suite's confidence; of a counterexample that "
-        "of Clopper and Pearson, 95 %",
+    interval: Interval | None = optional(
+        "of it: each end holds at all times together, at the suite's confidence; of a counterexample that "
+        "of Clopper and Pearson, 95 %"
     )
-    spp: int | None = Field(None, description="samples a pixel of the pictures; absent of a search")
-    picture: str | None = Field(None, description="a picture that the model gets wrong, in the run's folder")
-    part: str | None = Field(None, description="the run in `parts` that has the search; absent without one")
+    spp: int | None = optional("samples a pixel of the pictures; absent of a search")
+    picture: str | None = optional("a picture that the model gets wrong, in the run's folder")
+    part: str | None = optional("the run in `parts` that has the search; absent without one")
     repeat: str = Field("", description="the command that repeats it; absent where there is none")
     seconds: JsonFloat = Field(0.0, description="that it took")
 
     @property
     def accepted(self) -> bool:
-        """Whether it is no worse than expected."""
         return VERDICTS.index(self.answer) <= VERDICTS.index(self.expected)
 
 
@@ -76,7 +71,7 @@ class SuiteResult(InNotebook, RunResult):
     )
     confidence: float = Field(description="of each claim that is decided by drawn pictures")
     claims: list[ClaimResult]
-    added: str | None = Field(None, description="the file of the counterexample that was added; only with `add`")
+    added: str | None = optional("the file of the counterexample that was added; only with `add`")
     changes: list[str] = Field([], description="what is expected from now on; only with `update`")
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
@@ -88,17 +83,14 @@ class SuiteResult(InNotebook, RunResult):
 
     @property
     def status(self) -> int:
-        """Exit status of the command."""
         return 0 if self.added is not None else STATUS[self.answer]
 
 
 def verdict(claims: list[ClaimResult]) -> str:
-    """Return what a suite says as a whole: the worst of what was not expected."""
     return max((claim.answer for claim in claims if not claim.accepted), key=VERDICTS.index, default=HELD)
 
 
 RESULT = SuiteResult
-
 TABLE_HEADS = ("claim", "verdict", "pictures", "why")
 
 NOTE = (
@@ -113,7 +105,6 @@ NOT_YET = "not tried yet"
 
 
 def shown(result: SuiteResult) -> ShownResult:
-    """Return what the suite says, a table of its claims, and what repeats those that are not held."""
     runs = [claim.part for claim in result.claims]
     sections = [ResultPart("The claims", heads=TABLE_HEADS, rows=table_rows(result), note=NOTE, parts=runs)]
     for claim in result.claims:
@@ -127,7 +118,6 @@ def shown(result: SuiteResult) -> ShownResult:
 
 
 def statement(claim: AnyClaim, config: SceneConfig) -> str:
-    """Return what is claimed."""
     what = f"{short_name(config.object)}, {', '.join(config.controls)}"
     if isinstance(claim, RightClaim):
         spanned = "the frames" if "path" in config.controls else "the pictures"
@@ -169,7 +159,6 @@ def difference_reason(verdict: str, counts: tuple[int, int, int], interval: tupl
 
 
 def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, str]:
-    """Return what a search says of a claim that there is nothing to find, and why."""
     verified, clean = summary.verified, summary.clean.control
     if summary.ending == "already wrong":
         right = "" if clean is None else f": right in {clean.correct} of {clean.trials} trials"
@@ -193,7 +182,6 @@ def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, s
 
 
 def tried_reason(right: int, wrong: int, label: str, interval: tuple[float, float] | None) -> tuple[str, str]:
-    """Return what trials of a counterexample say, and why; the interval is of the share of right predictions."""
     if interval is None:
         return UNDECIDED, TIME_OVER
     if not wrong:
@@ -205,19 +193,16 @@ def tried_reason(right: int, wrong: int, label: str, interval: tuple[float, floa
 
 
 def table_rows(result: SuiteResult) -> list[list[str]]:
-    """Return a row for each claim, under `TABLE_HEADS`."""
-    return [[claim.name, verdict_text(claim), str(claim.pictures or ""), claim.reason] for claim in result.claims]
-
-
-def verdict_text(claim: ClaimResult) -> str:
-    """Return the verdict, with what was expected where that is another one."""
-    if claim.expected == HELD:
-        return claim.answer
-    return f"{claim.answer} ({'as expected' if claim.answer == claim.expected else f'expected: {claim.expected}'})"
+    rows = []
+    for claim in result.claims:
+        text = claim.answer
+        if claim.expected != HELD:
+            text += " (as expected)" if claim.answer == claim.expected else f" (expected: {claim.expected})"
+        rows.append([claim.name, text, str(claim.pictures or ""), claim.reason])
+    return rows
 
 
 def suite_text(result: SuiteResult) -> str:
-    """Return what a suite says as a whole, in a sentence."""
     if result.added is not None:
         return f"Kept as {result.added}."
     known = sum(claim.answer != HELD and claim.accepted for claim in result.claims)
@@ -227,7 +212,6 @@ def suite_text(result: SuiteResult) -> str:
 
 
 def facts(result: SuiteResult) -> dict[str, str]:
-    """Return what it was done with."""
     return {
         "model": result.model,
         "confidence": f"{percent(result.confidence)} for each claim that pictures decide",
@@ -238,7 +222,6 @@ def facts(result: SuiteResult) -> dict[str, str]:
 
 
 def claims(result: SuiteResult) -> Iterator[Claim]:
-    """Yield what the run stands for: what each claim of the suite came to, by its own test."""
     for tried in result.claims:
         text = f"{tried.name}: that {tried.statement} is {tried.answer}: {tried.reason}."
         kind: Kind = "nothing claimed" if tried.answer == UNDECIDED else "measured"
@@ -329,7 +312,6 @@ def sarif(result: SuiteResult) -> str:
 
 
 def markdown(result: SuiteResult) -> str:
-    """Return a heading, a table of the claims, and how to repeat what is not held."""
     lines = [f"### {_plain(result.title)}", "", _plain(suite_text(result)), ""]
     lines += [_line(TABLE_HEADS), _line(["---"] * len(TABLE_HEADS)), *map(_line, table_rows(result))]
     lines += ["", ", ".join(f"{name} {_plain(value)}" for name, value in facts(result).items())]
@@ -343,12 +325,10 @@ def _picture(result: SuiteResult, claim: ClaimResult) -> str:
 
 
 def _xml(text: str) -> str:
-    """What XML can hold of a text."""
     return re.sub(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "?", text)
 
 
 def _plain(text: str) -> str:
-    """A text in which Markdown has nothing to read."""
     return re.sub(r"([\\`*_{}\[\]<>#|])", r"\\\1", " ".join(text.split()))
 
 

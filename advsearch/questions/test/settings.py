@@ -91,7 +91,6 @@ class SuiteConfig(Config):
 
     @property
     def chosen(self) -> tuple[str, ...]:
-        """The names of what is tried; empty for all."""
         return () if self.only is None else split_names(self.only)
 
     @property
@@ -116,9 +115,7 @@ OWN = (*PLACE, "seed", "threads", "deterministic", "workers", "cluster", "second
 """Settings that the suite or its command says for all claims."""
 
 PICTURES, MOST = 400, 1_000_000  # pictures that a claim may take, and the most that it may ask for
-
 COUNTEREXAMPLES = "counterexamples"  # what stands for all of them, and no claim is called
-
 Settings = dict[str, object]
 
 EXPECTED = {
@@ -257,7 +254,6 @@ class Suite(_FromYaml):
 
 
 def read_suite(path: str | Path) -> Suite:
-    """Return the suite in a YAML file; a FileFormatError where it is missing or no YAML, or as for `suite_of`."""
     return suite_of(read_yaml(path), str(path))
 
 
@@ -273,7 +269,6 @@ def suite_of(data: Mapping[str, object], where: str) -> Suite:
 
 
 def _told(error: Any) -> str:
-    """What is wrong, in words: where, what was expected and what was got."""
     kind, place, got = error["type"], [str(part) for part in error["loc"] if part not in KINDS], shown(error["input"])
     if place[-1] == "[key]":  # a name that is a number
         return f"{place[0]}: expected names of small letters, digits and hyphens, got {got}; put it in quotes"
