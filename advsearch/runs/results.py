@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 
 SCHEMA = 1
-
 INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"  # endings of a run that can go on
 RUNNING = "running"  # how a result stands that is read while a process works on its run; none is kept so
 END = ("warnings", "seconds", "seed", "command_line")  # fields that are written last, in this order
@@ -35,7 +34,6 @@ Interval = tuple[JsonFloat, JsonFloat]  # both ends of a 95 % interval
 
 
 def having(*names: str) -> AfterValidator:
-    """Return the check that a mapping has these names."""
 
     def check(values: Mapping[str, object]) -> Mapping[str, object]:
         missing = [name for name in names if name not in values]
@@ -256,7 +254,6 @@ class GroupDerivative(Fields):
 
     @property
     def name(self) -> str:
-        """``control.parameter``."""
         return f"{self.control}.{self.parameter}"
 
 
@@ -500,10 +497,7 @@ class SharedWork(Fields):
 
 def kind_of(values: JsonObject) -> type[Result] | None:
     """Return the result that the values of a `summary.json` are of; None if there is none of that command."""
-    room = registry.room(str(values.get("command")))
-    if room is None:
-        return None
-    kind: type[Result] | None = next(
-        (kind for name, kind in (room.others or {}).items() if name in values), room.result
-    )
-    return kind
+    command = str(values.get("command"))
+    others = registry.part_of(command, "others") or {}
+    main: type[Result] | None = registry.part_of(command, "result")
+    return next((kind for name, kind in others.items() if name in values), main)

@@ -19,7 +19,7 @@ from advsearch.controls.sensor import SensorControl, through_sensor
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import control_group, verified_rate
-from advsearch.engine.verifier import RetrialCondition, Retrials, kept_configuration, unchanged
+from advsearch.engine.verifier import RetrialCondition, Retrials, kept_configuration
 from advsearch.errors import InputError
 from advsearch.progress import Progress, Watched, watcher
 from advsearch.question import Asked, carried_out
@@ -62,7 +62,7 @@ class Way:
     spp: int
     light: Hashable = None
     source: Hashable = None
-    change: Callable[[Tensor, int], Tensor] = unchanged
+    change: Callable[[Tensor, int], Tensor] | None = None
     missing: str = ""
 
     def condition(self) -> RetrialCondition:
@@ -76,7 +76,7 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
     renderer = problem.renderer
     scene, formation = renderer.scene, renderer.formation
 
-    def same(name: str, text: str, count: int = spp, change: Callable[[Tensor, int], Tensor] = unchanged) -> Way:
+    def same(name: str, text: str, count: int = spp, change: Callable[[Tensor, int], Tensor] | None = None) -> Way:
         return Way(name, text, lambda: problem, count, OWN_LIGHT, OWN_LIGHT, change)
 
     def traced(name: str, text: str, **made: Any) -> Way:

@@ -20,9 +20,9 @@ from torch import Tensor
 from advsearch import controls as families
 from advsearch.attacks import Block, Domain
 from advsearch.attacks.domain import Draws, Product
-from advsearch.controls import CONTROLS, Control, NumberControl, Parameter, Space
-from advsearch.controls.base import Fixed, Number, OneOf, Value, read, to_value
-from advsearch.controls.ranges import Range
+from advsearch.controls import CONTROLS, Control, Parameter, Space
+from advsearch.controls.base import Value
+from advsearch.controls.ranges import Fixed, Number, OneOf, Range, read
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import BY_KEY
 from advsearch.runs.results import VariedValue
@@ -68,7 +68,7 @@ def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[
         if axis.name in axes:
             raise InputError(f"`grid` {name}: {axis.name} is given twice; leave one of the two out")
         drawn = instances.get(axis.instance)
-        if isinstance(drawn, NumberControl) and axis.parameter.name in drawn.specs:
+        if drawn is not None and axis.parameter.name in drawn.specs:
             raise InputError(
                 f"`grid` {name}: `controls` {axis.instance} sets {axis.parameter.name} too; leave it out of one "
                 "of the two"
@@ -104,7 +104,7 @@ def _read_axis(name: str, values: Any, instances: Mapping[str, Control]) -> Axis
         raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, list(known), f"In {where}.")
     parameter = known[parameter_name]
     pictures = any(len(declared.shape) > 1 for declared in control.parameters)
-    if pictures or not issubclass(control, NumberControl) or parameter.shape != ():
+    if pictures or parameter.shape != ():
         raise InputError(
             f"{where}: expected a parameter that is one number or name, got one that is many numbers; draw it "
             f"by chance with `controls` {instance} `samples=100`"
@@ -185,15 +185,13 @@ def on_grid(controls: Sequence[Control], axes: Sequence[Axis], scene: SceneDescr
         moving = [axis for axis in axes if axis.instance == instance]
         drawn, settings = on.get(instance), dict[str, object]()
         kind: Any = CONTROLS[moving[0].control] if drawn is None else type(drawn)
-        if isinstance(drawn, NumberControl):
+        if drawn is not None:
             settings = {name: value for name, value in drawn.settings().items() if name not in ("kind", "name")}
             if not drawn.asked:  # the ranges that it has by default are spelled out
-                there = drawn.within(scene)
-                for parameter in drawn.parameters:
-                    reach = there.search_range(parameter)
-                    if parameter.name not in drawn.specs and reach is not None:
+                for parameter in map(drawn.within(scene).in_scene, drawn.parameters):
+                    if parameter.name not in drawn.specs and parameter.search is not None:
                         options = {"choices": list(parameter.options)} if parameter.options else None
-                        settings[parameter.name] = options or list(reach)
+                        settings[parameter.name] = options or list(parameter.search)
         settings |= {axis.parameter.name: {"choices": list(axis.values)} for axis in moving}
         on[instance] = kind(name=instance, **settings)
     return tuple(on.values())
@@ -286,7 +284,7 @@ class Points:
             into = small if block.size <= MOST_QUASI else large
             first = into[-1][2].stop if into else 0
             into.append((block, part, slice(first, first + block.size + (block.norm == "l2"))))
-            if block.size <= MOST_BINNED and block.norm != "l2" and isinstance(control, NumberControl):
+            if block.size <= MOST_BINNED and block.norm != "l2" and control.slots:
                 drawn += self._shown(control, group.parameter, part, first)
         self.drawn = tuple(drawn)
         dimensions = [chosen[-1][2].stop if chosen else 0 for chosen in (small, large)]
@@ -298,7 +296,7 @@ class Points:
         self.drawn_numbers = (dimensions[0], tuple((number.name, number.column, len(number.parts)) for number in drawn))
         self._described: dict[tuple[object, ...], Mapping[str, Value]] = {}
 
-    def _shown(self, control: NumberControl, name: str, part: slice, first: int) -> Iterator[Drawn]:
+    def _shown(self, control: Control, name: str, part: slice, first: int) -> Iterator[Drawn]:
         parameter, spec = _spec(control, name)
         full = f"{control.name}.{name}"
         if isinstance(spec, OneOf):
@@ -310,7 +308,7 @@ class Points:
             ends = torch.linspace(
                 float(self._lower[place]), float(self._upper[place]), self.parts + 1, dtype=torch.float64
             )
-            parts = tuple(map(list, pairwise(to_value(spec, parameter.log, ends).tolist())))
+            parts = tuple(map(list, pairwise(spec.at(ends, log=parameter.log).tolist())))
             yield Drawn(full + (f".{number}" if parameter.shape else ""), parameter.unit, first + number, parts)
 
     def parts_of(self, first: int, count: int) -> NDArray[np.int64]:
@@ -376,8 +374,7 @@ class Points:
         """
         rows, digits = [dict[str, Value]() for _ in u], self._digits(first, len(u))
         for control, coordinates in zip(self.space.controls, u.split(self.space.sizes, dim=1), strict=True):
-            methods = (type(control).describe, getattr(type(control), "measured", None))
-            if isinstance(control, NumberControl) and methods == (NumberControl.describe, NumberControl.measured):
+            if (type(control).describe, type(control).measured) == (Control.describe, Control.measured):
                 for name, unit, column in self._by_column(control, coordinates, digits):
                     for row, value in zip(rows, column, strict=True):
                         row[name] = {"value": value, "unit": unit}
@@ -399,7 +396,7 @@ class Points:
         return rows
 
     def _by_column(
-        self, control: NumberControl, coordinates: Tensor, digits: Sequence[NDArray[np.intp]]
+        self, control: Control, coordinates: Tensor, digits: Sequence[NDArray[np.intp]]
     ) -> Iterator[tuple[str, str, list[Any]]]:
         """Values of all configurations at once, parameter by parameter, with their units: the same as `describe`, sixty
         times as fast."""
@@ -419,14 +416,14 @@ class Points:
                     yield name, _unit(parameter), values
                 else:
                     full = name + (f".{number}" if parameter.shape else "")
-                    yield full, _unit(parameter), to_value(spec, parameter.log, column).tolist()
+                    yield full, _unit(parameter), spec.at(column, log=parameter.log).tolist()
 
 
 def _unit(parameter: Parameter) -> str:
     return "name" if parameter.options else parameter.unit
 
 
-def _spec(bound: NumberControl, name: str) -> tuple[Parameter, Range | OneOf]:
+def _spec(bound: Control, name: str) -> tuple[Parameter, Range | OneOf]:
     slot = next(slot for slot in bound.slots if slot.parameter.name == name)
     assert not isinstance(slot.spec, Fixed)
     return slot.parameter, slot.spec

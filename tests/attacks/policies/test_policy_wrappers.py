@@ -35,9 +35,8 @@ from advsearch.attacks import (
     search,
     seeded,
 )
-from advsearch.attacks.evaluation import affordable
 from advsearch.attacks.policies import choices
-from advsearch.attacks.policies.choices import MOST, Stay, with_choices
+from advsearch.attacks.policies.choices import MOST, with_choices
 from advsearch.errors import InputError, UnknownNameError
 
 BOX = Domain(torch.tensor([0.3, 0.6]), (Block(2),))
@@ -169,11 +168,11 @@ def test_renders_that_gradients_did_not_take_are_for_the_rounds_to_come() -> Non
 def test_what_is_affordable() -> None:
     domain = replace(BOX, gradient_cost=3)
     wanted = Proposal(BOX.start, gradient=True, samples=2)
-    assert affordable(wanted, domain, 9) is wanted
-    assert affordable(wanted, domain, 8).gradient is False
-    assert affordable(wanted, domain, 1).samples == 1
+    assert wanted.affordable(domain, 9) is wanted
+    assert wanted.affordable(domain, 8).gradient is False
+    assert wanted.affordable(domain, 1).samples == 1
     free = Proposal(BOX.start, gradient="free", samples=2)
-    assert (free.cost(domain), affordable(free, domain, 3).gradient, affordable(free, domain, 2).gradient) == (
+    assert (free.cost(domain), free.affordable(domain, 3).gradient, free.affordable(domain, 2).gradient) == (
         2,
         "free",
         False,
@@ -288,7 +287,7 @@ def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:
 
 def test_who_handles_choices_is_left_alone() -> None:
     choosy = Domain(torch.tensor([0.1, 0.5]), (Block(1, options=3), Block(1)))
-    for policy in (Auto(), Random(), Stay(), Portfolio()):
+    for policy in (Auto(), Random(), Portfolio()):
         assert with_choices(policy, choosy) is policy
     assert with_choices(PGD(), choosy) == Choices(PGD())
     assert with_choices(PGD(), BOX) == PGD()
