@@ -192,7 +192,7 @@ class Bare:
     def turn(self, count: int) -> float:
         """Render and classify so many pictures; return the seconds."""
         job, points = self.job, self.job.points(self.space)
-        u = points.configurations(points.picks(0, count))
+        u = points.configurations(0, count)
         inputs = [self.scene.assembly(self.space.inputs(one)) for one in u]
         begun = time.perf_counter()
         with torch.no_grad():

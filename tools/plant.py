@@ -215,8 +215,8 @@ FAULTS = (
     Fault(
         "sweeps: a rate of another group",
         "advsearch/questions/sweep/result.py",
-        "answer=counted(per_unit(after, draws), of),",
-        "answer=counted(per_unit(before, draws), of),",
+        "answer=counted_by_unit(after, draws),",
+        "answer=counted_by_unit(before, draws),",
         ("tests/engine/test_sweep.py",),
     ),
     Fault(

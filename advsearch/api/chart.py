@@ -26,7 +26,6 @@ from advsearch.report.sheets import MARGIN, blank
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 
 Floats = npt.NDArray[np.float64]
-
 COLOURS = np.array(list(itertools.product((0.1, 0.3, 0.5, 0.7, 0.9), repeat=3)))
 """(125, 3) sRGB: the printable colours of `--printable`."""
 COLUMNS, PITCH, PATCH, CORNER = 9, 15.0, 12.0, 9.0
@@ -36,6 +35,7 @@ SIZE = (COLUMNS * PITCH, ROWS * PITCH)  # width and height of all patches with t
 CORNERS = np.array([(x, y) for y in (-CORNER, SIZE[1] + CORNER) for x in (-CORNER, SIZE[0] + CORNER)])
 """(4, 2) middles of the black squares, from the upper left corner of the patches, in the order of reading."""
 LARGEST_SIDE = 8192
+MIDDLES = (np.stack(np.divmod(np.arange(len(COLOURS)), COLUMNS)[::-1], axis=1) + 0.5) * PITCH  # (125, 2) of the patches
 DARK = 0.35  # of the brightness of paper, under which a pixel may belong to a black square
 
 
@@ -50,17 +50,12 @@ def chart_page(title: str, paper: tuple[float, float], convert: Any) -> Figure:
 
     sent = Image.fromarray(np.round(255.0 * COLOURS[None]).astype(np.uint8))
     levels = np.asarray(sent if convert is None else ImageCms.applyTransform(sent, convert))[0] / 255.0
-    for (x, y), colour in zip(_middles(), levels, strict=True):
+    for (x, y), colour in zip(MIDDLES, levels, strict=True):
         square(x, y, PATCH, tuple(colour))
     for x, y in CORNERS:
         square(x, y, CORNER, "black")
     axes.text(paper[0] - MARGIN, paper[1] - MARGIN, f"{title}: colour chart", fontsize=7, ha="right", va="bottom")
     return figure
-
-
-def _middles() -> Floats:
-    row, column = np.divmod(np.arange(len(COLOURS)), COLUMNS)
-    return (np.stack([column, row], axis=1) + 0.5) * PITCH
 
 
 @helped
@@ -82,7 +77,7 @@ def measured_palette(photograph: str | Path) -> Tensor:
     crossings = np.array(list(itertools.product((-PITCH / 2.0, PITCH / 2.0), repeat=2)))
     close = np.array(list(itertools.product(np.linspace(-0.3, 0.3, 3) * (PITCH - PATCH), repeat=2)))
     measured = []
-    for middle in _middles():
+    for middle in MIDDLES:
         ink = np.median(_at(light, place, middle + offsets), axis=0)
         paper = [np.median(_at(light, place, middle + one + close), axis=0) for one in crossings]
         measured.append(ink / np.maximum(np.mean(paper, axis=0), 1e-4))

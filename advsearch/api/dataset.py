@@ -64,10 +64,8 @@ class Shown:
 
 @dataclass
 class Categories:
-    """The labels of the models, in the order of their outputs; of models without, what the object is called.
-
-    `unnamed` are the things that were seen and have no category.
-    """
+    """The labels of the models, in the order of their outputs; of models without, what the object is called; and the
+    things that were seen and have no category."""
 
     labels: tuple[str, ...] = ()
     unnamed: set[str] = field(default_factory=set)
@@ -94,18 +92,11 @@ class Categories:
 
 
 def write_dataset(run: str | Path, out: Path, format: str, *, every: bool, progress: Progress) -> tuple[int, list[str]]:
-    """Write the pictures of a run with what is true of them, whole or not at all.
-
-    Args:
-        run: name or folder of a run of `sweep` or `attack`, or of one with such parts (a suite, a study).
-        out: a folder; it is made, or empty.
-        format: "coco" or "yolo".
-        every: also pictures that all models are right about.
-
-    Returns how many pictures there are (of 0, nothing is written), and sentences that a reader has to know. Raises
-    InputError where the scene of the run is not to be had any more, or `out` is not empty, and FileFormatError where
-    the run is of another command, or has not ended.
-    """
+    """Write the pictures of a run of `sweep` or `attack`, or of one with such parts (a suite, a study), with what is
+    true of them, whole or not at all, to a folder that is made, or empty; as "coco" or "yolo", and `every` one or only
+    those that not all models are right about. Returns how many there are (of 0, nothing is written), and sentences that
+    a reader has to know. Raises InputError where the scene of the run is not to be had any more, or `out` is not empty,
+    and FileFormatError where the run is of another command, or has not ended."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"out: {out} is there already and not empty; name another folder")
     folder, categories = find_run(run), Categories()
@@ -119,10 +110,15 @@ def write_dataset(run: str | Path, out: Path, format: str, *, every: bool, progr
             for number, shown in enumerate(_pictures(folder, categories, every, progress), 1):
                 write_png(place / IMAGES / f"{shown.name}.png", shown.picture.numpy())
                 images.append(_image(number, shown))
-                listed = [_thing(len(things) + k, number, *one) for k, one in enumerate(shown.things, 1)]
-                things, others = things + listed, others + (not shown.same)
-                if format == "yolo":
-                    write_text(place / LABELS / f"{shown.name}.txt", _lines(listed, *shown.picture.shape[:2]))
+                things += [_thing(len(things) + k, number, *one) for k, one in enumerate(shown.things, 1)]
+                others += not shown.same
+                if format == "yolo":  # the class, the middle of the box and its size, as shares of the picture
+                    (height, width), text = shown.picture.shape[:2], ""
+                    for thing, category in shown.things:
+                        x, y, across, down = _box(thing)
+                        box = (x + across / 2) / width, (y + down / 2) / height, across / width, down / height
+                        text += f"{category} " + " ".join(f"{side:.6f}" for side in box) + "\n"
+                    write_text(place / LABELS / f"{shown.name}.txt", text)
             if not images:
                 return 0, []
             if format == "yolo":
@@ -147,9 +143,6 @@ def write_dataset(run: str | Path, out: Path, format: str, *, every: bool, progr
     if others:
         notes.append(f"In {others} of them the model says otherwise than the run's rows: something has changed since.")
     return len(images), notes
-
-
-# ---- pictures -------------------------------------------------------------------------------------------------------
 
 
 def _pictures(folder: Path, categories: Categories, every: bool, progress: Progress) -> Iterator[Shown]:
@@ -183,7 +176,7 @@ def _swept(folder: Path, categories: Categories, every: bool, progress: Progress
         view, (query, *_) = scenes.asked(number)
         place, some = job.places[view.number], sorted(rows[number], key=lambda row: row.step)
         facts, size = object_facts(place.scene, place.object, job.config), job.sizes[0]
-        picture = view.pictures([query])[0]
+        picture = view.picture(query)
         things = categories.things(job.tasks[0], facts, view.renderers[size], query.u)
         first = next((row.correct for row in some if row.step % len(job.models) == 0), None)
         same = first in (None, view.problems[0].judge(picture, query.u).right)
@@ -222,9 +215,6 @@ def object_facts(scene: Scene, name: str, config: SceneConfig) -> Facts:
 READ = {SweepConfig.command: _swept, AttackConfig.command: _attacked}
 
 
-# ---- as COCO has them -----------------------------------------------------------------------------------------------
-
-
 def _image(number: int, shown: Shown) -> JsonObject:
     height, width = shown.picture.shape[:2]
     predictions: list[dict[str, Any]] = [
@@ -242,13 +232,18 @@ def _image(number: int, shown: Shown) -> JsonObject:
     return {"id": number, "file_name": f"{shown.name}.png", "height": height, "width": width, "advsearch": extras}
 
 
-def _thing(number: int, image: int, thing: SeenThing, category: int) -> JsonObject:
+def _box(thing: SeenThing) -> tuple[float, float, float, float]:
+    """Its left and upper side, width and height, in pixels."""
     left, top, right, bottom = thing.box
+    return left, top, right - left, bottom - top
+
+
+def _thing(number: int, image: int, thing: SeenThing, category: int) -> JsonObject:
     return {
         "id": number,
         "image_id": image,
         "category_id": category,
-        "bbox": [left, top, right - left, bottom - top],
+        "bbox": [*_box(thing)],
         "area": int(thing.mask.sum()),
         "segmentation": {"size": [*thing.mask.shape], "counts": [*_runs(thing.mask)]},
         "iscrowd": 0,
@@ -264,13 +259,3 @@ def _runs(mask: Bools) -> list[int]:
     flat = mask.ravel(order="F")
     ends = [0, *(np.flatnonzero(np.diff(flat)) + 1).tolist(), flat.size]
     return [*[0][: int(flat[0])], *map(int, np.diff(ends))]
-
-
-def _lines(things: Sequence[Mapping[str, Any]], height: int, width: int) -> str:
-    """Number of the class, middle of the box and its size, as shares of the picture."""
-    lines = []
-    for thing in things:
-        left, top, across, down = thing["bbox"]
-        box = ((left + across / 2) / width, (top + down / 2) / height, across / width, down / height)
-        lines.append(f"{thing['category_id']} " + " ".join(f"{side:.6f}" for side in box))
-    return "\n".join([*lines, ""])

@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,6 @@ from torch import Tensor
 
 import advsearch
 from advsearch import seeds
-from advsearch.controls.base import Control
 from advsearch.controls.patch import enlarged
 from advsearch.controls.projector import ProjectorControl
 from advsearch.controls.space import file_name
@@ -31,7 +31,7 @@ from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import judged_alone, problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import AttackSummary, attack_of
+from advsearch.questions.attack.summary import attack_of
 from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
 from advsearch.runs.files import placed_by, read_png, storage_errors, to_8bit, write_bytes, write_png, write_text
@@ -73,10 +73,8 @@ class AdversarialRun:
 
 def adversarial_of(run: str | Path) -> AdversarialRun:
     """Load the scene of a run of `attack` that has ended, by its name or folder, and its adversarial configuration.
-
     Raises InputError where it has none, or its scene is another one now, and FileFormatError where it did not end, or
-    is of another command.
-    """
+    is of another command."""
     folder = find_run(run)
     summary = attack_of(folder)
     if summary.adversarial is None:
@@ -92,10 +90,8 @@ def adversarial_of(run: str | Path) -> AdversarialRun:
 def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     """Write the adversarial scene of a run as XML with its meshes and pictures beside it, whose names begin with its
     own, to a file that ends in .xml, or a folder for `scene.xml`; return sentences about how its picture becomes that
-    of the run, and what is no part of it.
-
-    Raises errors as `adversarial_of`, and InputError where such files are there, or stock Mitsuba has no such scene.
-    """
+    of the run, and what is no part of it. Raises errors as `adversarial_of`, and InputError where such files are there,
+    or stock Mitsuba has no such scene."""
     path = out if out.suffix.lower() == XML else out / NAME
     taken = [path, *path.parent.glob(f"{path.stem}-*")] if path.parent.is_dir() else []
     there = [file for file in taken if file.exists()]
@@ -187,19 +183,11 @@ def _alone(config: AttackConfig) -> Scene:
 
 
 def printable(run: str | Path, size: float) -> list[Piece]:
-    """Return what of a run's adversarial scene can be printed.
-
-    A patch is one piece. A texture has one for each connected part of the unwrapped surface, stretched along both sides
-    to the mean size that its texels have on the object; what is left of distortion within a piece is in its name.
-
-    Args:
-        run: of `attack`, that has ended.
-        size: of the real object, its longest side in millimetres, over 0.
-
-    Raises:
-        InputError: nothing of it can be printed, or the size is out of range.
-        FileFormatError: the run is of another kind or has not ended, or lacks its files.
-    """
+    """Return what of the adversarial scene of a run of `attack` can be printed, by the longest side of the real object
+    in millimetres. A patch is one piece. A texture has one for each connected part of the unwrapped surface, stretched
+    along both sides to the mean size that its texels have on the object; what is left of distortion within a piece is
+    in its name. Raises InputError where nothing can be printed, or the size is out of range, and FileFormatError where
+    the run is of another kind, has not ended, or lacks its files."""
     if not 1.0 <= size <= LONGEST:
         raise InputError(f"size: expected the object's longest side in millimetres, 1 to {LONGEST:.0f}, got {size}")
     folder = find_run(run)
@@ -209,7 +197,10 @@ def printable(run: str | Path, size: float) -> list[Piece]:
         picture = folder / ARTIFACTS / f"{file_name(control.name)}.png"
         if control.kind == "patch":
             pixels = read_png(folder / ARTIFACTS / f"{control.name}-pixels.png")
-            side = size * _side(control, summary, config.controls.get(control.name, {}).get("size"))
+            searched = (summary.configuration or {}).get(f"{control.name}.size")
+            fixed: Any = config.controls.get(control.name, {}).get("size") if searched is None else searched.value
+            default = next(parameter.default for parameter in control.parameters if parameter.name == "size")
+            side = size * float(fixed if isinstance(fixed, (int, float)) else default)
             pieces.append(_piece(f"{control.name}, {side:.1f} mm a side", pixels, (side / len(pixels),) * 2, None))
         elif isinstance(control, TextureControl) and picture.is_file():
             mesh, named = control.mesh_in(scene.description).mesh, control.materials_in(scene.description)
@@ -221,22 +212,10 @@ def printable(run: str | Path, size: float) -> list[Piece]:
     return pieces
 
 
-def _side(control: Control, summary: AttackSummary, given: object) -> float:
-    """The side of a patch in object sizes: what was found, what was given, or its default."""
-    found = (summary.configuration or {}).get(f"{control.name}.size")
-    if found is not None and isinstance(found.value, (int, float)):
-        return float(found.value)
-    default = next(parameter.default for parameter in control.parameters if parameter.name == "size")
-    return float(given if isinstance(given, (int, float)) else default)
-
-
 def _charts(name: str, texture: Floats, mesh: Mesh, faces: Ints | None, scale: float) -> Iterator[Piece]:
     """Yield the connected parts of a texture as they are seen from outside, the largest first; with `faces` those of
-    these faces.
-
-    Neighbouring texels of one part lie a distance apart on the surface; the mean over the part, along columns and rows,
-    is the size that they get. `scale` is in millimetres a mesh unit.
-    """
+    these faces. Neighbouring texels of one part lie a distance apart on the surface; the mean over the part, along
+    columns and rows, is the size that they get. `scale` is in millimetres a mesh unit."""
     areas = doubled_areas(mesh.uvs[mesh.faces].astype(np.float64))
     charts = rasterised(mesh, (texture.shape[0], texture.shape[1]))
     places = charts.positions().astype(np.float64)
@@ -246,8 +225,11 @@ def _charts(name: str, texture: Floats, mesh: Mesh, faces: Ints | None, scale: f
     for number, index in enumerate(order, 1):
         rows, columns = boxes[index]
         inside = labels[rows, columns] == index + 1
-        here = places[rows, columns] * scale
-        steps = [_steps(here, inside, axis) for axis in (1, 0)]
+        steps = []  # distances on the surface between texels that are neighbours along an axis
+        for axis in (1, 0):
+            lengths = np.linalg.norm(np.diff(places[rows, columns] * scale, axis=axis), axis=-1)
+            within = np.delete(inside, 0, axis) & np.delete(inside, -1, axis)
+            steps.append(lengths[within])
         if not all(len(step) for step in steps):
             continue  # a line of texels has no area to print
         pixel = float(np.mean(steps[0])), float(np.mean(steps[1]))
@@ -261,13 +243,6 @@ def _charts(name: str, texture: Floats, mesh: Mesh, faces: Ints | None, scale: f
         title = name if count == 1 else f"{name}, piece {number}"
         title += f" (sizes within it differ by {100 * stretch:.0f} %)" if stretch >= 0.005 else ""
         yield _piece(title, picture, pixel, inside)
-
-
-def _steps(places: np.ndarray, inside: Mask, axis: int) -> np.ndarray:
-    """Distances on the surface between texels that are neighbours along an axis, both inside; in millimetres."""
-    lengths = np.linalg.norm(np.diff(places, axis=axis), axis=-1)
-    both = np.minimum(inside.take(range(1, inside.shape[axis]), axis), inside.take(range(inside.shape[axis] - 1), axis))
-    return np.asarray(lengths[both.astype(bool)])
 
 
 def _piece(name: str, picture: Floats, pixel: tuple[float, float], inside: Mask | None) -> Piece:
@@ -294,10 +269,8 @@ SPP = 64  # samples a pixel of the picture of the scene with the marks
 def write_projection(run: str | Path, out: Path) -> list[str]:
     """Write a folder for each projector of a run's adversarial scene: `picture.png` to project, `texels.png` with the
     exact values, `marks.png` to project first, `seen.png`, where the run's camera sees these marks, and `README.txt`;
-    return sentences about what to set.
-
-    Raises errors as `adversarial_of`, and InputError where it has no projector, or the folder is there already.
-    """
+    return sentences about what to set. Raises errors as `adversarial_of`, and InputError where it has no projector, or
+    the folder is there already."""
     if out.exists():
         raise InputError(f"out: {out} is there already; choose another name")
     adversarial = adversarial_of(run)
@@ -318,33 +291,34 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
             write_png(folder / "picture.png", enlarged(pattern, factor))
             write_png(folder / "texels.png", pattern)
             write_png(folder / "marks.png", linear_to_srgb(marks))
-            write_png(folder / "seen.png", _seen(adversarial, control, part, linear_to_srgb(small)))
-            told = settings_of(control, values)
-            fov = math.tan(math.radians(control.part.fov) / 2.0)
-            where = [
-                f"{number}: row {row}, column {column}; {_angle(2 * x - 1, fov):.2f} degrees to the right of the "
-                f"middle, {_angle(1 - 2 * y, fov / control.part.aspect):.2f} up"
-                for number, (row, column, x, y) in enumerate(places, 1)
+            renderer, inputs = adversarial.problem.renderer, adversarial.inputs
+            inputs |= control.scene_inputs({**values, "pattern": linear_to_srgb(small)}, {})
+            traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+            seed = seeds.stream(adversarial.problem.seed, "marks")
+            with torch.no_grad():
+                rendered = renderer.rendered(traced, seed, SPP, "backdrop.color" in inputs)
+                write_png(folder / "seen.png", renderer.finished(rendered, inputs, adversarial.u))
+            number = {name: float(value) for name, value in values.items() if value.ndim == 0}
+            unit = "m" if control.scene.object.metres is not None else "object sizes"
+            fov, aspect, white = control.part.fov, control.part.aspect, control.measured(values, {})["white"]["value"]
+            half = math.tan(math.radians(fov) / 2.0)
+            settings = [
+                f"{number['lumens']:g} lumens for a white picture, {number['distance']:.3g} {unit} from the object's "
+                "middle",
+                f"a picture {fov:.3g} degrees wide (throw ratio {0.5 / half:.2f}), {aspect:.3g} times as wide as high",
+                f"azimuth {number['azimuth'] % 360.0:.4g} and elevation {number['elevation']:.4g} degrees around the "
+                "object",
+                f"ambient light of {number['ambient']:.4g} lux; white is {white:.4g} lux on the object",
             ]
-            text = ["Set:", *told, "", "Marks of marks.png, by texel from the upper left:", *where, ""]
+            where = []
+            for mark, (row, column, x, y) in enumerate(places, 1):
+                right, up = (math.degrees(math.atan(at)) for at in ((2 * x - 1) * half, (1 - 2 * y) * half / aspect))
+                at = f"{mark}: row {row}, column {column}"
+                where.append(f"{at}; {right:.2f} degrees to the right of the middle, {up:.2f} up")
+            text = ["Set:", *settings, "", "Marks of marks.png, by texel from the upper left:", *where, ""]
             write_text(folder / "README.txt", "\n".join(text), durable=False)
-            notes += told
+            notes += settings
     return notes
-
-
-def settings_of(control: ProjectorControl, values: dict[str, Tensor]) -> list[str]:
-    """Return what to set, in sentences; without ends, as a list."""
-    number = {name: float(value) for name, value in values.items() if value.ndim == 0}
-    unit = "m" if control.scene.object.metres is not None else "object sizes"
-    part = control.part
-    throw = 0.5 / math.tan(math.radians(part.fov) / 2.0)
-    measured = control.measured(values, {})
-    return [
-        f"{number['lumens']:g} lumens for a white picture, {number['distance']:.3g} {unit} from the object's middle",
-        f"a picture {part.fov:.3g} degrees wide (throw ratio {throw:.2f}), {part.aspect:.3g} times as wide as high",
-        f"azimuth {number['azimuth'] % 360.0:.4g} and elevation {number['elevation']:.4g} degrees around the object",
-        f"ambient light of {number['ambient']:.4g} lux; white is {measured['white']['value']:.4g} lux on the object",
-    ]
 
 
 def marked(sides: tuple[int, int], factor: int) -> tuple[Tensor, list[tuple[int, int, float, float]]]:
@@ -367,19 +341,3 @@ def marked(sides: tuple[int, int], factor: int) -> tuple[Tensor, list[tuple[int,
             draw.text((x + line, y + line), str(len(places)), fill=255, font_size=arm)
     levels = torch.frombuffer(bytearray(picture.tobytes()), dtype=torch.uint8).reshape(height, width, 1)
     return levels.expand(-1, -1, 3) / 255.0, places
-
-
-def _angle(share: float, tangent: float) -> float:
-    return math.degrees(math.atan(share * tangent))
-
-
-def _seen(adversarial: AdversarialRun, control: ProjectorControl, part: Tensor, marks: Tensor) -> Tensor:
-    """The scene as the run's camera sees it while another picture is thrown."""
-    renderer = adversarial.problem.renderer
-    inputs = adversarial.inputs
-    inputs |= control.scene_inputs({**control.values(part), "pattern": marks}, {})
-    traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
-    seed = seeds.stream(adversarial.problem.seed, "marks")
-    with torch.no_grad():
-        rendered = renderer.rendered(traced, seed, SPP, "backdrop.color" in inputs)
-        return renderer.finished(rendered, inputs, adversarial.u)

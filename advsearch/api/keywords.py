@@ -50,7 +50,6 @@ class _Signature(inspect.Signature):
 
 ONLY_BY_NAME = inspect.Parameter.KEYWORD_ONLY
 RUN = {"run": inspect.Parameter("run", ONLY_BY_NAME, default=None, annotation="str | Path | None")}
-
 KEPT = "The run is kept, in `run` or under runs/."
 SAME = {
     "object": "from `load_scene`, or the name of an object, or a file of one.",
@@ -59,17 +58,14 @@ SAME = {
 }
 RAISED = "InputError: anything that the caller can put right; nothing is written then."
 """What the docstrings of many questions say alike: of the run, of arguments, and of errors."""
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 Made = TypeVar("Made", bound=Config)
 
 
 def asks(config: type[Config]) -> Callable[[Function], Function]:
-    """Give a function that takes settings as `**settings` the signature and the docstring that they come to.
-
-    Every setting becomes a keyword with the default that it is declared with, and a line among the arguments. One that
-    the function has of its own stays as it is there.
-    """
+    """Give a function that takes settings as `**settings` the signature and the docstring that they come to. Every
+    setting becomes a keyword with the default that it is declared with, and a line among the arguments. One that the
+    function has of its own stays as it is there."""
 
     def decorate(function: Function) -> Function:
         own = inspect.signature(function)
@@ -111,18 +107,24 @@ def asks(config: type[Config]) -> Callable[[Function], Function]:
                     if loading.instances_in(plain[key]) or isinstance(plain[key], Mapping):
                         if loading.only_here(plain[key]):
                             check_not_spread(plain)
-                        stack.enter_context(
-                            loading.lending(
-                                loading.CONTROL, {one.name: one for one in loading.instances_in(plain[key])}
-                            )
-                        )
+                        instances = {control.name: control for control in loading.instances_in(plain[key])}
+                        stack.enter_context(loading.lending(loading.CONTROL, instances))
                         plain[key] = loading.settings_of(plain[key])
                 if "object" in own.parameters and "scene" not in own.parameters:
-                    loaded = {name: one for name, one in bound.arguments.items() if isinstance(one, LOADED)}
+                    # a scene and a model are lent, and the settings name them
+                    loaded = [value for value in bound.arguments.values() if isinstance(value, LOADED)]
                     if loaded:
                         check_not_spread(plain)
                         args, plain = (), {**dict(zip(own.parameters, args, strict=False)), **plain}
-                        plain |= _named(loaded, plain, stack)
+                    for value in loaded:
+                        if isinstance(value, loading.Scene):
+                            check_not_of_scene({name: plain[name] for name in plain if name != "object"})
+                            described = loading.scene_as_settings(value).items()
+                            plain |= {name: setting for name, setting in described if setting is not None}
+                            stack.enter_context(loading.lending(loading.SCENE, {plain["object"]: value}))
+                        else:
+                            plain["model"] = model_name(value)
+                            stack.enter_context(loading.lending(loading.MODEL, {plain["model"]: value}))
                 return function(*args, **plain)
 
         asked.__doc__ = _docstring(function.__doc__ or "", [one.name for one in plain], config.command, lines)
@@ -138,7 +140,6 @@ WRITTEN = {
     "estimators": "str | Mapping[str, str]",
 }  # fmt: skip
 """What may be written for some settings beside what they become."""
-
 LISTED = (*SEVERAL, "prompt", "vary", "ways", "quantities", "samplers", "case", "group")
 """Settings that may be a list of names."""
 
@@ -147,6 +148,7 @@ def hint_of(field: str, kind: Any) -> str:
     """Return what Python callers may write for a setting that is declared as `kind`: for a text also a path, and for
     what may be several names a list."""
     text = inspect.formatannotation(kind).replace("typing.", "").replace("NoneType", "None")
+    text = re.sub(r"Annotated\[(\w+), .*?\]\)\]", r"\1", text)  # bounds are no part of a hint
     if field in WRITTEN and not (field == "label" and "dict" in text):  # a recipe's may be one of each object
         return WRITTEN[field]
     match = re.fullmatch(r"Optional\[(.*)\]", text)
@@ -174,17 +176,3 @@ def configured(config: type[Made], **given: object) -> Made:
     return made.with_only_here(
         [*parts, *(f"the control {name}" for name in loading.only_here(loading.all_lent(loading.CONTROL)))]
     )
-
-
-def _named(loaded: Mapping[str, Any], given: Mapping[str, Any], stack: ExitStack) -> dict[str, Any]:
-    """Lend a scene and a model that a question takes by name, and return the settings that name them."""
-    named: dict[str, Any] = {}
-    for one in loaded.values():
-        if isinstance(one, loading.Scene):
-            check_not_of_scene({name: value for name, value in given.items() if name != "object"})
-            named |= {name: value for name, value in loading.scene_as_settings(one).items() if value is not None}
-            stack.enter_context(loading.lending(loading.SCENE, {named["object"]: one}))
-        else:
-            named["model"] = model_name(one)
-            stack.enter_context(loading.lending(loading.MODEL, {named["model"]: one}))
-    return named

@@ -22,7 +22,6 @@ PACKAGE = Path(__file__).parent.parent
 
 def own_names(kind: str) -> list[str]:
     """Return the names of the package's own "control"s, "policy"s or "task"s, read from their files without an import.
-
     Tests hold them to the registries."""
     if kind == "control":
         named = {path.stem if path.stem != "__init__" else path.parent.name: path for path in _files("controls")}

@@ -68,19 +68,15 @@ def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
         raise InputError(f"run: expected the name of a run or its folder, got {run!r:.80}")
     path = find_run(run)
     result = read_result(path)
-    if isinstance(result, AttackSummary):
-        return _attack(path, result)
-    return SweepResult(result, path) if isinstance(result, SweepSummary) else result
-
-
-def _attack(path: Path, summary: AttackSummary) -> AttackResult:
+    if not isinstance(result, AttackSummary):
+        return SweepResult(result, path) if isinstance(result, SweepSummary) else result
     clean, adversarial = (read_png(path / IMAGES / f"{name}.png") for name in ("clean", "adversarial"))
     artifacts = dict[str, Tensor]()
     for file in sorted((path / ARTIFACTS).glob("*.exr")):
         planes, _ = read_exr(file, read_bytes(file, "a picture of a run", LARGEST_FILE))
         artifacts[file.stem] = torch.from_numpy(np.stack([np.asarray(plane, np.float32) for plane in planes], axis=-1))
     return AttackResult(
-        summary=summary,
+        summary=result,
         run=path,
         u=torch.from_numpy(read_configuration(path)),
         clean=torch.from_numpy(clean),
@@ -118,7 +114,6 @@ def load_model(
 load_model.__doc__ = models.load_model.__doc__
 load_model.__signature__ = inspect.signature(models.load_model)  # type: ignore[attr-defined]
 load_model = helped(load_model)
-
 render = names_code(helped(in_turn()(shows_progress(rendering.render))))
 
 

@@ -29,11 +29,9 @@ from typing import Any
 from advsearch.errors import InputError
 
 WORKERS = 16  # requests that are answered at once; others wait
-
 WAITING = 128
 """Connections that may be open beside those that are served. More wait in the operating system, without a file open
 here."""
-
 PATIENCE = 10.0  # seconds in which a client has to have said what it asks for
 SLOWEST = 50_000  # bytes a second at which it has to take the answer at least, beyond as long as `PATIENCE`
 GRACE = 1.0  # seconds that a slow client has where others wait
@@ -114,19 +112,11 @@ class _Served:
 
 
 class Clients:
-    """Serves connections until `close`.
-
-    Args:
-        listening: what accepts them.
-        answer: is called with each, in a worker's thread. It says when it waits for the client (`wait_for`) or works.
-        context: of HTTPS; None speaks HTTP.
-    """
+    """Serves the connections that a socket accepts until `close`, with HTTPS if there is a context. `answer` is called
+    with each, in a worker's thread, and says when it waits for the client (`wait_for`) or works."""
 
     def __init__(
-        self,
-        listening: socket.socket,
-        answer: Callable[[socket.socket, Any], None],
-        context: ssl.SSLContext | None,
+        self, listening: socket.socket, answer: Callable[[socket.socket, Any], None], context: ssl.SSLContext | None
     ) -> None:
         self._listening, self._answer, self._context = listening, answer, context
         # Who came last is served first: a crowd may be there to keep others out.
@@ -136,7 +126,6 @@ class Clients:
         self._ended.set()
 
     def serve(self) -> None:
-        """Accept clients until `close`."""
         self._ended.clear()
 
         def work() -> None:
@@ -152,7 +141,6 @@ class Clients:
             self._ended.set()
 
     def close(self) -> None:
-        """End `serve`, and let the workers end."""
         self._closed.set()
         self._ended.wait()
         with suppress(Empty):
@@ -195,22 +183,17 @@ class Clients:
                 del silent[connection]
                 selector.unregister(connection)
                 connection.close()
-            self._end_slow(now)
+            served = sorted(self._served.copy().values(), key=lambda one: one.since)
+            others = self._ready.qsize() if len(served) == WORKERS else 0
+            for one in served:  # where others wait, those end too that have had `GRACE`, the slowest first
+                pressed = others > 0 and now - one.since > GRACE
+                if one.due < now or pressed:
+                    others -= 1
+                    one.since = one.due = math.inf
+                    with suppress(OSError):  # not the method of an SSL socket, which would forget that it is one
+                        socket.socket.shutdown(one.connection, socket.SHUT_RDWR)
         for connection in silent:
             connection.close()
-
-    def _end_slow(self, now: float) -> None:
-        """End the connections whose time is up; where others wait, those too that have had `GRACE`, the slowest
-        first."""
-        served = sorted(self._served.copy().values(), key=lambda one: one.since)
-        others = self._ready.qsize() if len(served) == WORKERS else 0
-        for one in served:
-            pressed = others > 0 and now - one.since > GRACE
-            if one.due < now or pressed:
-                others -= 1
-                one.since = one.due = math.inf
-                with suppress(OSError):  # not the method of an SSL socket, which would forget that it is one
-                    socket.socket.shutdown(one.connection, socket.SHUT_RDWR)
 
     def serve_one(self, connection: socket.socket, address: Any) -> None:
         """Answer one client, in this thread; whatever it does, nothing is raised."""

@@ -24,13 +24,9 @@ if TYPE_CHECKING:
 
 MOST_LEVELS = 65535  # different names of one axis, or predictions, that are told apart; further ones are one: "others"
 UNKNOWN = 2  # `right` of a row whose prediction was not judged
-
 NO_PROBABILITY = 65535
-
 BOX_STEPS = 8  # of a pixel, in which the corners of boxes are counted
-
 NO_BOX = 65535
-
 OTHERS = "boxes"  # where a frame keeps the boxes of its rows, in its `attrs`
 OF_A_BOX = 6  # numbers of a box among `Boxes`: its corners, the place of its name, its score
 
@@ -46,7 +42,6 @@ class Boxes:
     names: dict[str, int] = field(default_factory=dict)
 
     def put(self, payload: Mapping[str, Any]) -> None:
-        """Add the boxes of a row."""
         things = payload.get("things", {})
         true = [(one["box"], name, None) for name, one in things.items() if one.get("box")]
         found = [(one["box"], one["label"], float(one["score"])) for one in payload.get("found", ())]

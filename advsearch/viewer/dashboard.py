@@ -15,7 +15,6 @@ from advsearch.report import wording
 from advsearch.report.shown import Html, element, join_html
 from advsearch.runs import files, listing, store
 from advsearch.runs.directory import PARTS, REPORT
-from advsearch.runs.listing import Listed
 from advsearch.runs.results import plain
 from advsearch.viewer.document import data_script, data_url, document, in_address, scrolled
 from advsearch.viewer.thumbnails import thumbnail
@@ -25,37 +24,35 @@ def list_page(runs: Mapping[str, Path]) -> str:
     """Return the page that lists runs, by the name under which each is shown; the newest first."""
     listed = [(name, listing.listed_run(path, counts=False)) for name, path in runs.items()]
     listed.sort(key=lambda named: named[1].when or 0.0, reverse=True)
-    sweeps = sum(run.command == "sweep" for _, run in listed)
-    heads = [*(["side by side"] if sweeps > 1 else []), "picture", "run", "what came out", "begun"]
+    several = sum(run.command == "sweep" for _, run in listed) > 1
+    heads = [*(["side by side"] if several else []), "picture", "run", "what came out", "begun"]
+    lines = list[Html]()
+    for name, run in listed:
+        place, sweep = f"runs/{in_address(name)}/", run.command == "sweep"
+        box = element("input", type="checkbox", name="run", value=name, aria_label=f"compare {name}") if sweep else None
+        picture = element("img", src=f"{place}cover", alt="", loading="lazy", width="72", height="72")
+        linked = element("a", None if run.fault else picture, href=place, tabindex="-1", aria_hidden="true")
+        about = ", ".join(filter(None, (run.command, wording.short_names(run.object), " and ".join(run.controls))))
+        photos = element("a", "photographs", href=f"{place}align/", aria_label=f"photographs of {name}")
+        beside = join_html(" ", photos) if run.command in ("attack", "sweep") else None
+        came_out = join_html(run.state, f": {run.answer}" if run.answer else None)
+        fault = element("div", run.fault, class_="remarks") if run.fault else None
+        begun = "" if run.when is None else time.strftime("%Y-%m-%d %H:%M", time.localtime(run.when))
+        cells = [element("td", box)] if several else []
+        cells += [
+            element("td", linked),
+            element("th", element("a", name, href=place), element("div", about, beside, class_="soft"), scope="row"),
+            element("td", came_out, fault),
+            element("td", begun, class_="number"),
+        ]
+        lines.append(element("tr", *cells))
     head = element("tr", *(element("th", text, scope="col") for text in heads))
-    lines = (_line(name, run, comparable=sweeps > 1) for name, run in listed)
     made = element("table", element("thead", head), element("tbody", *lines), class_="runs")
     button = element("p", element("button", "Show the chosen sweeps side by side", type="submit"))
-    form = element("form", scrolled(made), button if sweeps > 1 else None, action="compare/")
+    form = element("form", scrolled(made), button if several else None, action="compare/")
     none = element("p", "No runs here yet: advsearch sweep, or advsearch attack, makes one.")
     title = element("header", element("h1", "Runs"))
     return document("Runs", title, element("main", form if listed else none), connects=True)
-
-
-def _line(name: str, one: Listed, *, comparable: bool) -> Html:
-    place, sweep = f"runs/{in_address(name)}/", one.command == "sweep"
-    box = element("input", type="checkbox", name="run", value=name, aria_label=f"compare {name}") if sweep else None
-    picture = (
-        element("img", src=f"{place}cover", alt="", loading="lazy", width="72", height="72") if not one.fault else None
-    )
-    about = ", ".join(filter(None, (one.command, wording.short_names(one.object), " and ".join(one.controls))))
-    photos = element("a", "photographs", href=f"{place}align/", aria_label=f"photographs of {name}")
-    beside = join_html(" ", photos) if one.command in ("attack", "sweep") else None
-    begun = "" if one.when is None else time.strftime("%Y-%m-%d %H:%M", time.localtime(one.when))
-    fault = element("div", one.fault, class_="remarks") if one.fault else None
-    return element(
-        "tr",
-        element("td", box) if comparable else None,
-        element("td", element("a", picture, href=place, tabindex="-1", aria_hidden="true")),
-        element("th", element("a", name, href=place), element("div", about, beside, class_="soft"), scope="row"),
-        element("td", join_html(one.state, f": {one.answer}" if one.answer else None), fault),
-        element("td", begun, class_="number"),
-    )
 
 
 MOST_ROWS = 2000  # evaluations that are sent at once; the page asks for the rest

@@ -10,8 +10,7 @@ import hashlib
 import json
 import os
 import re
-import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -21,8 +20,7 @@ from advsearch import __version__
 from advsearch.files import MESHES
 from advsearch.report import wording
 from advsearch.report.shown import Html, element, join_html
-from advsearch.report.wording import is_command
-from advsearch.runs.directory import CONFIG, PARTS, REPORT
+from advsearch.runs.directory import PARTS, REPORT
 
 MOST_NOTES = 3  # notes on files that are not folded
 
@@ -31,7 +29,6 @@ _OF_A_FILE = re.compile(
     re.IGNORECASE,
 )
 """How what is said of the reading of a file begins, and of a value that a control leaves out."""
-
 LONG = 32  # letters of a cell above which its text is broken into lines
 
 SCRIPTS = (
@@ -52,16 +49,9 @@ def document(
     connects: bool = False,
     footer: str = "",
 ) -> str:
-    """Return a page as HTML.
-
-    Args:
-        title: of the window.
-        body: what stands in it, before the footer.
-        data: scripts that hold what the script reads.
-        scripts: files of the viewer that run in it, one after the other: one of `SCRIPTS`.
-        connects: whether it asks its server for rows and pictures; else it cannot ask anybody.
-        footer: a sentence at its end.
-    """
+    """Return a page as HTML, with a title of the window, what stands in it, before the footer, a sentence, scripts that
+    hold `data`, and files of the viewer that run in it, one after the other: one of `SCRIPTS`. It `connects` if it asks
+    its server for rows and pictures; else it cannot ask anybody."""
     code = _code(scripts)
     policy = _policy([_digest(code.encode())] if code else [], connects=connects)
     head = element(
@@ -97,23 +87,20 @@ def _own_digests() -> frozenset[str]:
 
 def has_other_scripts(page: bytes) -> bool:
     """Whether a page has a script that is none of `SCRIPTS`, such as that of another version, and so will not run where
-    `served_policy` holds."""
-    return any(_digest(code) not in _own_digests() for code in _scripts(page))
-
-
-def _scripts(page: bytes) -> Iterator[bytes]:
-    """Yield the scripts of a page, without those that are data, in one pass: the page may be somebody else's."""
+    `served_policy` holds. Scripts that are data do not count; one pass, as the page may be somebody else's."""
     end = 0
-    for found in re.finditer(rb"<script", page, re.IGNORECASE):
-        if found.start() < end:
+    for opening in re.finditer(rb"<script", page, re.IGNORECASE):
+        if opening.start() < end:
             continue
-        begin = page.find(b">", found.end()) + 1
+        begin = page.find(b">", opening.end()) + 1
         if not begin:
-            return
+            return False
         close = re.compile(rb"</script", re.IGNORECASE).search(page, begin)
         end = close.start() if close else len(page)
-        if not page.startswith(b' type="application/', found.end()):
-            yield page[begin:end]
+        is_data = page.startswith(b' type="application/', opening.end())
+        if not is_data and _digest(page[begin:end]) not in _own_digests():
+            return True
+    return False
 
 
 def _policy(digests: Iterable[str], *, connects: bool) -> str:
@@ -125,13 +112,9 @@ def _policy(digests: Iterable[str], *, connects: bool) -> str:
 
 
 def served_policy(*, own: bool) -> str:
-    """Return the `Content-Security-Policy` that a server sends.
-
-    Args:
-        own: with a page that it has made itself: this may ask its server for more. All else lies in the folder of a
-            run, which may be somebody else's: it gets an origin of its own, so that it can read and send nothing, and
-            runs no script but those of `SCRIPTS`.
-    """
+    """Return the `Content-Security-Policy` that a server sends. A page that it has made itself may ask its server for
+    more. All else lies in the folder of a run, which may be somebody else's: it gets an origin of its own, so that it
+    can read and send nothing, and runs no script but those of `SCRIPTS`."""
     sandbox = "form-action 'none'; sandbox allow-scripts allow-popups allow-popups-to-escape-sandbox"
     closed = "form-action 'self'" if own else sandbox
     return f"{_policy(_own_digests(), connects=own)}; frame-ancestors 'none'; {closed}"
@@ -160,11 +143,7 @@ def scrolled(inside: Html | None, css: str = "") -> Html:
 
 @cache
 def asset(name: str) -> str:
-    """Return a file of the viewer."""
     return (resources.files("advsearch.viewer") / "static" / name).read_text(encoding="utf-8")
-
-
-# ---- what pages have in common ---------------------------------------------------------------------------------------
 
 
 def heading(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
@@ -195,7 +174,7 @@ def subject_html(*parts: tuple[str, str]) -> Html:
 
 def facts_table(facts: Mapping[str, str]) -> Html:
     """Return names with their values; those that are empty are left out."""
-    known = {name: value for name, value in facts.items() if value}.items()
+    known = ((name, value) for name, value in facts.items() if value)
     lines = (element("tr", element("th", name, scope="row"), element("td", value)) for name, value in known)
     return element("table", element("tbody", *lines), class_="facts")
 
@@ -215,26 +194,22 @@ def study_table(
         name = element("a", first, href=link) if link else first
         shown = []
         for at, text in enumerate(cells, 1):
-            css, share = "number" if len(text) <= LONG else "long", (shares or {}).get((number, at))
-            shown.append(
-                element("td", text, class_=css if share is None else f"number share share-{round(10 * share)}")
-            )
-        drawn = [element("td", _bar(bars[number]), class_="hide-small")] if bars else []
-        lines.append(element("tr", element("th", name, scope="row"), *shown, *drawn))
+            share = (shares or {}).get((number, at))
+            css = "number" if len(text) <= LONG else "long"
+            css = css if share is None else f"number share share-{round(10 * share)}"
+            shown.append(element("td", text, class_=css))
+        if bars:
+            drawn = None
+            if (bar := bars[number]) is not None:
+                low, high, mark = bar
+                reach = element("span", style=f"left: {low:.1%}; width: {high - low:.1%}", class_="range")
+                marked = element("span", style=f"left: {mark:.1%}", class_="mark")
+                drawn = element("div", reach, marked, class_="interval", aria_hidden="true")
+            shown.append(element("td", drawn, class_="hide-small"))
+        lines.append(element("tr", element("th", name, scope="row"), *shown))
     beside = element("td", class_="hide-small") if bars else None
     head = element("tr", *(element("th", text, scope="col") for text in heads), beside)
     return scrolled(element("table", element("thead", head), element("tbody", *lines)))
-
-
-def _bar(bar: tuple[float, float, float] | None) -> Html | None:
-    if bar is None:
-        return None
-    low, high, mark = bar
-    spans = (
-        element("span", style=f"left: {low:.1%}; width: {high - low:.1%}", class_="range"),
-        element("span", style=f"left: {mark:.1%}", class_="mark"),
-    )
-    return element("div", *spans, class_="interval", aria_hidden="true")
 
 
 def part_links(run: Path, parts: Sequence[str | None]) -> list[str]:
@@ -242,22 +217,3 @@ def part_links(run: Path, parts: Sequence[str | None]) -> list[str]:
     names = ["" if part is None else Path(part).name for part in parts]
     there = [name and (run / PARTS / name / REPORT).is_file() for name in names]
     return [f"{PARTS}/{in_address(name)}/{REPORT}" if has else "" for name, has in zip(names, there, strict=True)]
-
-
-def again(run: Path, command_line: str, *, goes_on: bool) -> Html:
-    """Return the commands that ask the same again, all settings, and the command that goes on with what was stopped."""
-    recipe, on = run / CONFIG, []
-    commands = [shlex.join(["advsearch", "run", str(recipe)])] if recipe.is_file() and is_command(command_line) else []
-    commands += [command_line] if command_line else []
-    if goes_on:
-        resume = shlex.join(["advsearch", "resume", str(run)])
-        on = [element("h2", "Go on"), element("pre", resume, class_="wrap")]
-    settings = recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else ""
-    return join_html(
-        *on,
-        element("h2", "Do it again"),
-        *(element("pre", one, class_="wrap") for one in commands),
-        element("details", element("summary", "All settings"), element("pre", settings, class_="wrap"))
-        if settings
-        else None,
-    )

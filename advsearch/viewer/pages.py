@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import json
+import shlex
 import struct
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -15,22 +16,10 @@ from typing import TypeVar
 from advsearch import registry
 from advsearch.errors import FileFormatError
 from advsearch.files import read_bytes
-from advsearch.report.shown import (
-    NARROW,
-    WIDE,
-    Html,
-    Picture,
-    ResultPart,
-    ShownResult,
-    element,
-    facts_of,
-    join_html,
-    remarks_of,
-    shown,
-    study_chart,
-    subject_of,
-)
-from advsearch.runs.directory import IMAGES, OBJECT_FILE, REPORT, RunDirectory
+from advsearch.report import shown as showing
+from advsearch.report.shown import Html, Picture, ResultPart, ShownResult, element, join_html
+from advsearch.report.wording import is_command
+from advsearch.runs.directory import CONFIG, IMAGES, OBJECT_FILE, REPORT, RunDirectory
 from advsearch.runs.files import smaller_png, write_text
 from advsearch.runs.results import Result
 from advsearch.runs.summary import read_result
@@ -38,10 +27,8 @@ from advsearch.viewer import document
 
 LARGEST_FIGURE = 2_000_000  # bytes of a figure or a picture that the page takes along
 LARGEST_PNG = 50_000_000  # bytes of a picture that is read to be made smaller
-
 LARGE_PICTURE = 1_000_000
 """Bytes above which a PNG is put into the page at a smaller size; the file itself stays as it is."""
-
 SMALLER_SIDE = 640  # longest side in pixels of such a smaller picture
 KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}  # media types of pictures
 
@@ -58,7 +45,10 @@ def part_html(run: Path, one: ResultPart, said: str) -> Html:
     chart = None
     if one.draw is not None:
         words = " ".join([f"{one.title}.", *(one.text or [said])])
-        chart = element("div", *(study_chart(one.draw, words, width, one.height) for width in (WIDE, NARROW)))
+        chart = element(
+            "div",
+            *(showing.study_chart(one.draw, words, width, one.height) for width in (showing.WIDE, showing.NARROW)),
+        )
     table = None
     if one.heads:
         table = document.study_table(one.heads, one.rows, document.part_links(run, one.parts), one.shares, one.bars)
@@ -102,16 +92,25 @@ def _figure(run: Path, name: str, alt: str) -> Html | None:
 
 
 def end_html(run: Path, result: Result, given: ShownResult) -> Html:
-    """Return what stands at the end of a page: how the result came about, and the commands that ask the same again."""
-    facts = {name[:1].upper() + name[1:]: text for name, text in facts_of(result, given).items()}
-    again = document.again(run, getattr(result, "command_line", ""), goes_on=result.goes_on)
-    return join_html(element("h2", "Cost and conditions"), document.facts_table(facts), again)
+    """Return what stands at the end of a page: how the result came about, the commands that go on with what was stopped
+    and that ask the same again, and all settings."""
+    facts = {name[:1].upper() + name[1:]: text for name, text in showing.facts_of(result, given).items()}
+    recipe, command_line = run / CONFIG, getattr(result, "command_line", "")
+    parts = [element("h2", "Cost and conditions"), document.facts_table(facts)]
+    if result.goes_on:
+        resume = shlex.join(["advsearch", "resume", str(run)])
+        parts += [element("h2", "Go on"), element("pre", resume, class_="wrap")]
+    commands = [shlex.join(["advsearch", "run", str(recipe)])] if recipe.is_file() and is_command(command_line) else []
+    commands += [command_line] if command_line else []
+    parts += [element("h2", "Do it again"), *(element("pre", command, class_="wrap") for command in commands)]
+    if settings := recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else "":
+        whole = element("pre", settings, class_="wrap")
+        parts.append(element("details", element("summary", "All settings"), whole))
+    return join_html(*parts)
 
 
 AnyResult = TypeVar("AnyResult", bound=Result)
-
 LARGEST = 2_700_000  # bytes of an object that a page takes along
-
 _WORDS = "Drag it, or choose it and press the arrow keys. It is lit evenly here, not by the scene's light."
 
 
@@ -134,7 +133,6 @@ def object_part(data: bytes) -> ResultPart:
 
 
 def object_data(data: bytes) -> list[Html]:
-    """Return the script that holds the object, if there is one."""
     return [document.data_script(base64.b64encode(data).decode("ascii"), "object-file")] if data else []
 
 
@@ -159,7 +157,7 @@ def page_of(run: Path, result: Result) -> str:
     results of the run are damaged."""
     page = registry.part_of(result.command, "page")
     made: str | None = page(run, result) if page else None
-    return made or shown_page(run, result, shown(result))
+    return made or shown_page(run, result, showing.shown(result))
 
 
 def keep_result(run: RunDirectory, result: AnyResult) -> AnyResult:
@@ -188,9 +186,9 @@ def shown_page(
         lines = [element("li", element("a", name, href=link) if link else name) for name, link in linked]
         inside.append(element("details", element("summary", f"The runs ({len(parts)})"), element("ul", *lines)))
     main = element("main", *inside, end_html(run, result, given))
-    subject = subject_of(result, given)
+    subject = showing.subject_of(result, given)
     what = join_html(result.command, "; " if subject else None, document.subject_html(*(("", one) for one in subject)))
-    header = document.heading(what, given.said, remarks_of(result, given))
+    header = document.heading(what, given.said, showing.remarks_of(result, given))
     footer = f"run {run.name}. This page needs no other file."
     title = f"{run.name}, {result.command}"
     return document.document(title, header, main, data=data, scripts=scripts, footer=footer)

@@ -18,7 +18,7 @@ import re
 import secrets
 import ssl
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -30,58 +30,33 @@ from advsearch.files import read_bytes
 from advsearch.questions.photographs import result as photos
 from advsearch.questions.sweep.page import SweepSource, result_of, sweep_page_html
 from advsearch.report.shown import element, join_html
-from advsearch.runs import files, listing
+from advsearch.runs import directory, files, listing
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
-from advsearch.viewer.clients import (
-    LARGEST_SENT,
-    PATIENCE,
-    SLOWEST,
-    TICK,
-    Clients,
-    Refused,
-    https_context,
-    is_address,
-    reachable,
-)  # fmt: skip
+from advsearch.viewer import clients
+from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, Refused, https_context, is_address, reachable
 from advsearch.viewer.columns import packed, read_columns
 from advsearch.viewer.dashboard import START, following_page, is_under_way, list_page, progress_json
 from advsearch.viewer.document import has_other_scripts, in_address, served_policy
 from advsearch.viewer.thumbnails import cover, kept_pictures, read_thumbnail
 
 LOOPBACK = "127.0.0.1"
-
 FIRST_PART, PART = 4_000, 50_000
 """Rows of a sweep that goes on that are sent at once; reading more takes longer than somebody waits for the first."""
-
 LARGEST, LARGEST_PAGE = 1 << 30, 1 << 28  # most bytes of a sweep's columns, and of a page that lies in a run
 SENDING = 60.0  # seconds in which a photograph has to have come
-
 FAULT = "this page could not be made, which is a fault of advsearch"
-
 BACKLOG = 4096  # connections that may wait in the operating system
 LONGEST = 4096  # characters of an address
-
 COOKIE = "advsearch"
+NUMBERED = re.compile(r"[0-9]+/[0-9]{1,12}\.jpg")  # a thousand pictures have a folder
 
 
 class Dashboard(HTTPServer):
-    """The server. `serve_forever` answers until `shutdown`.
-
-    Args:
-        runs: folders of runs; empty for those in ``runs/``, looked up anew for each request.
-        host: address to listen at.
-        port: 0 takes a free one.
-        https: speak HTTPS on this machine too; beyond it that is always so.
-        photographs: takes photographs in; None refuses them.
-
-    Attributes:
-        token: what every request has to bring; None on this machine only.
-        fingerprint: SHA-256 of the certificate; None without HTTPS.
-        photographs: as given.
-
-    Raises:
-        InputError: the address can't be listened at, or there is nothing to make a certificate.
-    """
+    """The server, of folders of runs, or of those in ``runs/``, looked up anew for each request; `serve_forever`
+    answers until `shutdown`. A `port` of 0 takes a free one; beyond this machine it always speaks HTTPS; without what
+    takes `photographs` in, these are refused. Every request has to bring the `token`; None on this machine only. The
+    `fingerprint` is SHA-256 of the certificate; None without HTTPS. Raises InputError where the address can't be
+    listened at, or there is nothing to make a certificate."""
 
     request_queue_size = BACKLOG
     allow_reuse_address = True
@@ -120,12 +95,10 @@ class Dashboard(HTTPServer):
 
     @property
     def scheme(self) -> str:
-        """``"https"`` or ``"http"``."""
         return "http" if self._context is None else "https"
 
     @property
     def address(self) -> str:
-        """What to open in a browser."""
         return self.address_of("/")
 
     def address_of(self, path: str) -> str:
@@ -135,7 +108,6 @@ class Dashboard(HTTPServer):
         return f"{self.scheme}://{host}:{self.server_port}{path}" + (f"?token={self.token}" if self.token else "")
 
     def runs(self) -> Mapping[str, Path]:
-        """The runs that are shown, by the name under which they are."""
         found = (path for path in sorted(HOME.glob("*")) if path.is_dir() and is_run(path))
         return self._given or {path.name: path for path in found}
 
@@ -158,7 +130,6 @@ class Dashboard(HTTPServer):
             return list_page(self.runs())
 
     def serve_forever(self, poll_interval: float = TICK) -> None:
-        """Answer until `shutdown`."""
         self.clients.serve()
 
     def shutdown(self) -> None:
@@ -166,11 +137,11 @@ class Dashboard(HTTPServer):
         self.clients.close()
 
     def server_close(self) -> None:
-        """Stop listening."""
         self.clients.close()
         super().server_close()
 
 
+Query = Mapping[str, list[str]]
 OTHERS = served_policy(own=False)
 
 
@@ -228,8 +199,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     do_HEAD = do_POST = do_GET
 
-    # ---- who may ask -------------------------------------------------------------------------------------------------
-
     def _check(self) -> None:
         if len(self.path) > LONGEST:
             raise Refused(HTTPStatus.REQUEST_URI_TOO_LONG, "the address is too long")
@@ -260,8 +229,6 @@ class _Handler(BaseHTTPRequestHandler):
             return name in ("localhost", LOOPBACK, "[::1]")
         return name in ("localhost", self.server._host) or is_address(name.removeprefix("[").removesuffix("]"))
 
-    # ---- what is answered --------------------------------------------------------------------------------------------
-
     def _served(self) -> tuple[Served, dict[str, str]]:
         if not self.path.startswith("/"):
             raise Refused(HTTPStatus.BAD_REQUEST, "this server is no proxy")
@@ -272,26 +239,50 @@ class _Handler(BaseHTTPRequestHandler):
             # Lax: a link on the page of a run, which has an origin of its own, leads back to the list
             cookie = f"{COOKIE}-{self.server.server_port}={self.server.token}"
             headers["Set-Cookie"] = f"{cookie}; HttpOnly; Secure; SameSite=Lax; Path=/"
-        for pattern, answer in _POSTED if self.command == "POST" else _ROUTES:
-            if match := re.fullmatch(pattern, address.path):
-                names = (unquote(name, errors="surrogateescape") for name in match.groups())
-                return Served(*answer(self, query, *names)), headers
+        # names of files may be no text
+        parts = [unquote(part, errors="surrogateescape") for part in address.path.split("/")[1:]]
+        return self._answer(query, parts), headers
+
+    def _answer(self, query: Query, parts: list[str]) -> Served:
+        """Return what is at an address, by its parts; nothing but a photograph is sent to any."""
+        server = self.server
+        if self.command == "POST":
+            match parts:
+                case ["runs", name, "align", "renderings", file]:
+                    run, key = server.run(name), server.key(name)
+                    return Served(*photos.take(server.photographs, run, file, self.headers, key, self._body))
+            raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
+        match parts:
+            case [""]:
+                return _own(server.list_page())
+            case ["compare", ""]:
+                return self._compare(query)
+            case ["runs", name, ""]:
+                run = server.run(name)
+                if listing.listed_run(run, counts=False).command == "sweep":
+                    return _own(sweep_page_html([(run, result_of(run))], [_source(name, run, "")]), "../../")
+                return _own(following_page(name, run), "../../") if is_under_way(run) else _kept(run, "../../")
+            case ["runs", name, "cover"]:
+                return Served("image/jpeg", cover(server.run(name)))
+            case ["runs", name, "rows"]:
+                return self._rows(query, server.run(name))
+            case ["runs", name, "progress"]:
+                return Served("application/json", progress_json(server.run(name), _after(query)))
+            case ["runs", name, directory.PARTS, part, directory.REPORT]:  # of a study, whose page links to it
+                attack = next((path for path in (server.run(name) / PARTS).iterdir() if path.name == part), None)
+                if attack is None or not (attack / REPORT).is_file():
+                    raise Refused(HTTPStatus.NOT_FOUND, "there is no such attack")
+                return _kept(attack, "../../../../", ("../../", name))
+            case ["runs", name, "pictures", folder, file] if NUMBERED.fullmatch(f"{folder}/{file}"):
+                return Served("image/jpeg", read_thumbnail(server.run(name), int(file.removesuffix(".jpg"))))
+            case ["runs", name, "align", ""]:
+                run, key = server.run(name), server.key(name)
+                elsewhere = server.address_of(f"/runs/{in_address(name)}/align/") if server.token else None
+                page = photos.photographs_html(server.photographs, run, name, key, elsewhere)
+                return _own(page, "../../../", ("../", name))
+            case ["runs", name, "align", ("renderings" | "photos") as kind, file]:
+                return Served(*photos.picture(kind.removesuffix("s"), server.run(name), file))
         raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
-
-    def _page(self, _query: Query, name: str) -> Served:
-        run = self.server.run(name)
-        if listing.listed_run(run, counts=False).command == "sweep":
-            return _own(sweep_page_html([(run, result_of(run))], [_source(name, run, "")]), "../../")
-        if is_under_way(run):
-            return _own(following_page(name, run), "../../")
-        return _kept(run, "../../")
-
-    def _part(self, _query: Query, name: str, part: str) -> Served:
-        """The page of one of the attacks that a study consists of, where the study's page links to it."""
-        run = next((path for path in (self.server.run(name) / PARTS).iterdir() if path.name == part), None)
-        if run is None or not (run / REPORT).is_file():
-            raise Refused(HTTPStatus.NOT_FOUND, "there is no such attack")
-        return _kept(run, "../../../../", ("../../", name))
 
     def _compare(self, query: Query) -> Served:
         runs = [(name, self.server.run(name)) for name in dict.fromkeys(query.get("run", []))]
@@ -303,8 +294,7 @@ class _Handler(BaseHTTPRequestHandler):
         sources = [_source(name, run, f"../runs/{in_address(name)}/") for name, run in runs]
         return _own(sweep_page_html([(run, result_of(run)) for _, run in runs], sources), "../")
 
-    def _rows(self, query: Query, name: str) -> Served:
-        run = self.server.run(name)
+    def _rows(self, query: Query, run: Path) -> Served:
         after = _after(query)
         if not after and (run / COLUMNS).is_file() and listing.finished(run):
             return Served("application/octet-stream", read_bytes(run / COLUMNS, "columns of a sweep", LARGEST))
@@ -313,66 +303,19 @@ class _Handler(BaseHTTPRequestHandler):
         columns = read_columns(run, after, part)
         return Served("application/octet-stream", packed(columns, more=len(columns) == part, running=running))
 
-    def _progress(self, query: Query, name: str) -> Served:
-        return Served("application/json", progress_json(self.server.run(name), _after(query)))
-
-    def _cover(self, _query: Query, name: str) -> Served:
-        return Served("image/jpeg", cover(self.server.run(name)))
-
-    def _picture(self, _query: Query, name: str, number: str) -> Served:
-        return Served("image/jpeg", read_thumbnail(self.server.run(name), int(number)))
-
-    # ---- photographs -------------------------------------------------------------------------------------------------
-
-    def _align(self, _query: Query, name: str) -> Served:
-        server, run, key = self.server, self.server.run(name), self.server.key(name)
-        elsewhere = server.address_of(f"/runs/{in_address(name)}/align/") if server.token else None
-        page = photos.photographs_html(server.photographs, run, name, key, elsewhere)
-        return _own(page, "../../../", ("../", name))
-
-    def _take(self, _query: Query, name: str, rendering: str) -> Served:
-        server, run, key = self.server, self.server.run(name), self.server.key(name)
-        return Served(*photos.take(server.photographs, run, rendering, self.headers, key, self._body))
-
     def _body(self) -> bytes:
-        """What was sent along; nothing is read of what says that it is larger than `LARGEST_SENT`."""
+        """What was sent along; nothing is read of what says that it is larger than `clients.LARGEST_SENT`."""
         length = self.headers.get("Content-Length", "")
         if not re.fullmatch(r"[0-9]{1,15}", length):
             raise Refused(HTTPStatus.LENGTH_REQUIRED, "its length is missing")
-        if int(length) > LARGEST_SENT:
-            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {LARGEST_SENT >> 20} MB")
+        if int(length) > clients.LARGEST_SENT:
+            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"more than {clients.LARGEST_SENT >> 20} MB")
         self.server.clients.wait_for(SENDING)
         data = self.rfile.read(int(length))
         self.server.clients.wait_for(None)
         if len(data) < int(length):
             raise Refused(HTTPStatus.BAD_REQUEST, "a part of it did not come")
         return data
-
-    def _rendering(self, _query: Query, name: str, rendering: str) -> Served:
-        return Served(*photos.picture("rendering", self.server.run(name), rendering))
-
-    def _photo(self, _query: Query, name: str, photo: str) -> Served:
-        return Served(*photos.picture("photo", self.server.run(name), photo))
-
-
-Query = Mapping[str, list[str]]
-Routes = tuple[tuple[str, Callable[..., Served]], ...]
-
-_ROUTES: Routes = (
-    ("/", lambda self, _: _own(self.server.list_page())),
-    ("/compare/", _Handler._compare),
-    ("/runs/([^/]+)/", _Handler._page),
-    ("/runs/([^/]+)/cover", _Handler._cover),
-    ("/runs/([^/]+)/rows", _Handler._rows),
-    ("/runs/([^/]+)/progress", _Handler._progress),
-    (f"/runs/([^/]+)/{PARTS}/([^/]+)/{re.escape(REPORT)}", _Handler._part),
-    (r"/runs/([^/]+)/pictures/[0-9]+/([0-9]{1,12})\.jpg", _Handler._picture),
-    ("/runs/([^/]+)/align/", _Handler._align),
-    ("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._rendering),
-    ("/runs/([^/]+)/align/photos/([^/]+)", _Handler._photo),
-)
-
-_POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)  # what is sent, not asked for
 
 
 def _after(query: Query) -> int:

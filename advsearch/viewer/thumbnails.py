@@ -60,7 +60,6 @@ def _jpeg(image: Image.Image) -> bytes:
 
 
 def path_of(run: Path, number: int) -> Path:
-    """Return where the thumbnail of a picture is kept."""
     return run / SMALL_PICTURES / f"{number // A_FOLDER:04d}" / f"{number}.jpg"
 
 

@@ -346,10 +346,9 @@ def test_what_is_rendered_is_what_was_listed(scene: advsearch.Scene) -> None:
     points = points_of(scene, grid)
     space = make_space(on_grid((), axes, scene.description), scene.description)
     assert points.count == 24 * 3 * 3
-    picks = points.picks(0, points.count)
-    u = points.configurations(picks)
+    u = points.configurations(0, points.count)
     listed = list(itertools.product(*(axis.values for axis in axes)))
-    for one, wanted, said in zip(u, listed, points.values(u, picks), strict=True):
+    for one, wanted, said in zip(u, listed, points.values(u, 0), strict=True):
         shown = space.describe(one)
         assert list(said) == ["pose.yaw", "camera.elevation", "environment.which"]
         for axis, value in zip(axes, wanted, strict=True):
@@ -364,18 +363,16 @@ def test_a_long_axis_is_exact(scene: advsearch.Scene) -> None:
         on_grid((), read_axes({"camera.elevation": "-80:80:99991"}, ()), scene.description), scene.description
     )
     for number in (0, 1, 33_333, 77_777, 99_990):
-        picks = points.picks(number, 1)
-        u = points.configurations(picks)
-        said = points.values(u, picks)[0]["camera.elevation"]["value"]
+        u = points.configurations(number, 1)
+        said = points.values(u, number)[0]["camera.elevation"]["value"]
         assert space.describe(u[0])["camera.elevation"]["value"] == float(np.float32(said))
 
 
 def test_what_is_not_in_the_grid_stays_or_is_drawn(scene: advsearch.Scene) -> None:
     alone = points_of(scene, {"pose.yaw": [0, 90]})
-    assert [one.shape for one in alone.configurations(alone.picks(0, 2))] == [(1,), (1,)]
+    assert [one.shape for one in alone.configurations(0, 2)] == [(1,), (1,)]
     drawn = points_of(scene, {"pose.yaw": [0, 90]}, (make_control("pose"),), samples=4)
-    picks = drawn.picks(0, 8)
-    said = drawn.values(drawn.configurations(picks), picks)
+    said = drawn.values(drawn.configurations(0, 8), 0)
     assert set(said[0]) == {f"pose.{name}" for name in ("yaw", "pitch", "roll", "x", "y", "scale")}
     assert [one["pose.yaw"]["value"] for one in said] == [0.0] * 4 + [90.0] * 4
     assert len({one["pose.pitch"]["value"] for one in said}) == 8
@@ -390,9 +387,8 @@ def test_the_fast_way_says_what_the_control_says(scene: advsearch.Scene, control
     drawn = (make_control(control),)
     points = points_of(scene, {}, drawn, samples=16)
     space = make_space(drawn, scene.description)
-    picks = points.picks(3, 10)
-    u = points.configurations(picks)
-    for one, said in zip(u, points.values(u, picks), strict=True):
+    u = points.configurations(3, 10)
+    for one, said in zip(u, points.values(u, 3), strict=True):
         assert said == space.describe(one)
 
 
@@ -456,16 +452,15 @@ def test_draws_stay_in_their_budget_and_cover_it(scene: advsearch.Scene) -> None
     points = points_of(scene, {}, drawn, samples=200)
     space = make_space(drawn, scene.description)
     domain = domain_of(space.controls)
-    u = points.configurations(points.picks(0, 200))
+    u = points.configurations(0, 200)
     assert all(domain.contains(one) for one in u)
     texels = (u[:, : 16 * 16 * 3] - space.start[: 16 * 16 * 3]).abs()
     assert 0.09 < float(texels.max()) <= 0.1 + 1e-6
-    picks = points.picks(0, 200)
-    values = points.values(u, picks)
+    values = points.values(u, 0)
     scales = [math.log2(float(one["pose.scale"]["value"])) for one in values]
     assert abs(np.mean(scales)) < 0.02 and min(scales) < -0.95 and max(scales) > 0.95
     assert [one.name for one in points.drawn] == ["pose.yaw", "pose.scale"]
-    assert torch.equal(points.configurations(points.picks(150, 3)), u[150:153])
+    assert torch.equal(points.configurations(150, 3), u[150:153])
 
 
 def test_a_million_million_points_start_at_once(scene: advsearch.Scene) -> None:
@@ -475,8 +470,7 @@ def test_a_million_million_points_start_at_once(scene: advsearch.Scene) -> None:
     began = time.process_time()
     points = Points(space, domain_of(space.controls), axes, 1, "sobol", 0)
     assert points.count == 10**12
-    picks = points.picks(10**12 - 8, 8)
-    said = points.values(points.configurations(picks), picks)
+    said = points.values(points.configurations(10**12 - 8, 8), 10**12 - 8)
     assert time.process_time() - began < 10.0
     assert [round(float(said[-1][name]["value"]), 6) for name in grid] == [359.964, 60.0, 0.1]
 

@@ -75,7 +75,7 @@ def test_pictures_are_those_that_are_rendered() -> None:
         job_of(SweepConfig(object="mug", **SMALL, grid={"camera.azimuth": "0:360:4", "camera.elevation": [5, 60]})), 0
     )
     queries = [query for _, _, query in scene.job.queries(range(8))]
-    predicted = scene.pictures(queries)
+    predicted = torch.stack([scene.picture(query) for query in queries])
     traced = torch.stack([scene.problems[0].picture(query.u, seed=9, spp=64) for query in queries])
     apart = 255.0 * ((predicted[:, None] - traced[None]) ** 2).mean(dim=(2, 3, 4)).sqrt()
     assert apart.argmin(dim=1).tolist() == list(range(8))

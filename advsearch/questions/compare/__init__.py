@@ -78,7 +78,6 @@ class CompareConfig(SweepConfig):
 
     @property
     def title(self) -> tuple[str, ...]:
-        """What is compared, and that it is."""
         return "-".join(Path(name).stem for name in split_names(self.object or self.compared)), self.command
 
     def sweep(self) -> SweepConfig:

@@ -44,7 +44,6 @@ FOLLOWS = (
 """Settings that do not tell sweeps apart: of draws, along with object and model, or of no adversarial scene."""
 TOLERANCE = 1e-4  # Of a value, relative to the largest in its column: values come from single precision
 MOST_VALUES = 64  # Different numbers of a parameter, beyond which it has no table unless the sweep says how it is cut
-
 Mask = npt.NDArray[np.bool_]
 
 
@@ -74,12 +73,10 @@ class Side:
 
 
 def read_sides(folders: Sequence[Path]) -> list[Side]:
-    """Return what the sweeps in some folders compare, each side with a name of its own.
-
-    A sweep has a side for each of its models. The sweep of an adversarial scene has these without it and with it;
-    beside other sweeps, only with it. Raises FileFormatError where a folder has another run, or a sweep that has not
-    ended, and InputError where there is nothing to compare, or sweeps are of other draws.
-    """
+    """Return what the sweeps in some folders compare, each side with a name of its own. A sweep has a side for each of
+    its models. The sweep of an adversarial scene has these without it and with it; beside other sweeps, only with it.
+    Raises FileFormatError where a folder has another run, or a sweep that has not ended, and InputError where there is
+    nothing to compare, or sweeps are of other draws."""
     sides = [side for folder in folders for side in _sides_of(folder, alone=len(folders) == 1)]
     if len(sides) < 2:
         raise InputError(
@@ -210,14 +207,9 @@ def compared(first: Side, second: Side, seed: int, *, rules: bool = True) -> Com
 
 def _counts(first: Mask, second: Mask, units: npt.NDArray[np.int64]) -> dict[str, Any]:
     difference, interval, _ = paired_by_unit(first, second, units)
-    return {
-        "both": int((first & second).sum()),
-        "first_only": int((first & ~second).sum()),
-        "second_only": int((~first & second).sum()),
-        "neither": int((~first & ~second).sum()),
-        "difference": difference,
-        "interval": interval,
-    }
+    of = {"both": first & second, "first_only": first & ~second, "second_only": ~first & second}
+    counts = {name: int(pairs.sum()) for name, pairs in {**of, "neither": ~first & ~second}.items()}
+    return {**counts, "difference": difference, "interval": interval}
 
 
 def _parts(column: pd.Series, edges: Sequence[float] | None) -> Iterator[tuple[Any, Mask]]:
@@ -268,8 +260,17 @@ class PairPictures:
         together = first.folder == second.folder and first.rows["number"].equals(second.rows["number"])
         sides = {"a": first} if together else {"a": first, "b": second}
         files = {(place, side): f"images/pair-{pair}-{place}-{side}.jpg" for place in places for side in sides}
+        missing: list[tuple[str, int, Path, Side]] = []
         with self.asked.until_interrupted():
-            self._make([(sides[side], place, folder / name) for (place, side), name in files.items()])
+            for (place, which), name in files.items():
+                side = sides[which]
+                number = int(side.rows["number"][place])
+                kept = thumbnails.kept_file(side.folder, number)
+                if kept is not None:
+                    write_bytes(folder / name, kept.read_bytes(), durable=False)
+                elif not (folder / name).is_file():
+                    missing.append((str(side.folder), number, folder / name, side))
+            self._render(missing)
         for place in places:
             names = [files[place, side] for side in sides]
             values = first.rows.loc[place, first.varying].items()
@@ -281,15 +282,7 @@ class PairPictures:
                 pictures=names if all((folder / name).is_file() for name in names) else [],
             )
 
-    def _make(self, wanted: Sequence[tuple[Side, int, Path]]) -> None:
-        missing: list[tuple[str, int, Path, Side]] = []
-        for side, place, file in wanted:
-            number = int(side.rows["number"][place])
-            kept = thumbnails.kept_file(side.folder, number)
-            if kept is not None:
-                write_bytes(file, kept.read_bytes(), durable=False)
-            elif not file.is_file():
-                missing.append((str(side.folder), number, file, side))
+    def _render(self, missing: Sequence[tuple[str, int, Path, Side]]) -> None:
         if missing:
             self.asked.progress.stage("rendering pictures again", len(missing), hint="`pictures` says how many")
         for folder, number, file, side in sorted(missing, key=lambda picture: picture[:2]):

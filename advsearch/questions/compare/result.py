@@ -48,7 +48,6 @@ class PairCounts(Fields):
 
     @property
     def pairs(self) -> int:
-        """How many there are."""
         return self.both + self.first_only + self.second_only + self.neither
 
     @property
@@ -118,7 +117,6 @@ class CompareResult(InNotebook, RunResult):
 
     @property
     def brief(self) -> str:
-        """Accuracy of each side."""
         return ", ".join(f"{one.name} {one.accuracy:.1%}" for one in self.sides if one.accuracy is not None)
 
 
@@ -140,8 +138,6 @@ MOST_TABLES, MOST_PICTURES = 4, 3
 
 
 def shown(result: CompareResult) -> ShownResult:
-    """Return each side's accuracy, the pairs, where one is worse, and pictures that one alone gets right."""
-
     def cost(one: ComparedSide) -> str:
         if one.seconds != one.seconds:
             return ""
@@ -174,7 +170,6 @@ def headline(pair: ComparedPair) -> str:
 
 
 def points_text(interval: Interval) -> str:
-    """Return an interval of a difference: ``-25.2 to -8.1``."""
     return " to ".join(f"{100.0 * end:+.1f}" for end in interval)
 
 
@@ -261,7 +256,6 @@ def _alone(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
 
 
 def claims(result: CompareResult) -> Iterator[Claim]:
-    """Yield what the run stands for: what was counted of each pair of sides."""
     for pair in result.pairs:
         how = "Newcombe's, of pairs" if pair.units is None else "over drives"
         text = f"{headline(pair)} {alone_text(pair)} The interval of the difference is {how}."

@@ -54,7 +54,6 @@ class ExplainConfig(Config):
 
     @property
     def title(self) -> tuple[str, ...]:
-        """The first run, and what is asked of it."""
         return Path(split_names(self.sweeps)[0]).name, self.command
 
 
@@ -74,14 +73,7 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
             recipe, its sweeps.
     """
     # these import torch, scipy and pandas
-    from advsearch.questions.explain.findings import (
-        cautions,
-        find_envelope,
-        find_importance,
-        not_told,
-        right_of,
-        rule_counts,
-    )
+    from advsearch.questions.explain import findings
     from advsearch.questions.explain.renders import AskedSweep, Renders, read_predictions
     from advsearch.rules import FEWEST_ROWS, find_rules, halves, is_shown, observed
 
@@ -99,17 +91,18 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
     progress.stage("seeking rules on one half of the rows")
     found = find_rules(choosing, counting, config.seed)
     progress.stage("measuring which parameters matter")
-    importance = find_importance(table)
-    box = find_envelope(choosing, counting, config.accuracy)
+    importance = findings.find_importance(table)
+    box = findings.find_envelope(choosing, counting, config.accuracy)
     renders = Renders(asked, sweeps, rows, table)
     rules = [
-        RuleRow(**rule_counts(one), confirmed=renders.confirmed(found.told, n)) for n, one in enumerate(found.told)
+        RuleRow(**findings.rule_counts(one), confirmed=renders.confirmed(found.told, n))
+        for n, one in enumerate(found.told)
     ]
     pairs = list(renders.pairs(found.told))
     clusters = renders.clusters()
     if renders.interrupted:
         asked.ending = INTERRUPTED
-    counted = right_of(table)
+    counted = findings.right_of(table)
     return asked.result(
         ExplainResult,
         sweeps=[str(sweep.folder) for sweep in sweeps],
@@ -121,14 +114,14 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
         **vars(counted),
         units=None if table["unit"].is_unique else table["unit"].nunique(),
         rules=rules,
-        not_told=not_told(found.next, len(table)),
+        not_told=findings.not_told(found.next, len(table)),
         importance=importance,
         envelope=box,
         pairs=pairs,
         pairs_sought=min(config.pairs, counted.total - counted.right),
         clusters=clusters,
         renders=renders.count,
-        warnings=[*renders.warnings, *cautions(table, importance)],
+        warnings=[*renders.warnings, *findings.cautions(table, importance)],
     )
 
 

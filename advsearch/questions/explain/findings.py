@@ -33,18 +33,10 @@ from scipy.optimize import brentq
 from scipy.stats import chi2, ncf, ncx2
 from scipy.stats import f as fisher
 
+from advsearch import rules
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.questions.explain.result import EnvelopeRow, ParameterWeight, RightOf, RuleNotTold
-from advsearch.rules import CHANCE as RULES_CHANCE
-from advsearch.rules import (
-    FEWEST_ROWS,
-    CountedRule,
-    RuleCondition,
-    RuleConditions,
-    covered,
-    import_library,
-    interval_of,
-)
+from advsearch.rules import CountedRule, RuleCondition, RuleConditions, covered, interval_of
 
 MOST_PARTS = 20
 ROWS_IN_A_CELL = 25  # Rows that a cell of two factors' parts has on average, at least
@@ -52,7 +44,6 @@ CHANCE = 0.01
 """Probability that any pair is told to decide together where none does; each is tested at its part (Bonferroni)."""
 LEAST_SPREAD = 0.1
 """What chance adds for units, at least, of what it adds to independent predictions, though units deviate in nothing."""
-
 Places = npt.NDArray[np.int64]
 
 
@@ -214,18 +205,14 @@ def _peeled(conditions: RuleConditions, inside: pd.DataFrame) -> Iterator[RuleCo
                 yield tuple(box[name] for name in inside.attrs["units"] if name in box)
 
 
-# ---- rules as results have them -----------------------------------------------------------------------------------
-
-
 def right_of(rows: pd.DataFrame) -> RightOf:
-    """Return a count with the interval of its share."""
     return RightOf(right=int(rows["correct"].sum()), total=len(rows), interval=interval_of(rows))
 
 
 def cautions(table: pd.DataFrame, importance: Sequence[ParameterWeight]) -> list[str]:
     """Return what a reader has to know of the rows of a table and of what decides."""
     texts, draws = list[str](), table["unit"].nunique()
-    if draws < FEWEST_ROWS:
+    if draws < rules.FEWEST_ROWS:
         texts.append(f"The rows are of {draws} draws, each with several, which are not independent: few show little.")
     if table["correct"].nunique() < 2:
         always = "right" if table["correct"].all() else "wrong"
@@ -249,7 +236,7 @@ def not_told(rule: CountedRule | None, rows: int) -> RuleNotTold | None:
     if times is not None:  # with two digits that mean something: 173.2 becomes 180
         step: int = 10 ** max(0, math.floor(math.log10(times * rows)) - 1)
         needed = math.ceil(times * rows / step) * step
-    return RuleNotTold(**rule_counts(rule), chance=rule.chance, asked=RULES_CHANCE, rows=needed)
+    return RuleNotTold(**rule_counts(rule), chance=rule.chance, asked=rules.CHANCE, rows=needed)
 
 
 MOST, FEWEST = 6, 8  # Clusters at most, and failures of which clusters are sought at least
@@ -269,17 +256,15 @@ class Clusters:
 
 
 def find_clusters(features: NDArray[np.float64], seed: int) -> Clusters:
-    """Group failures by k-means over the directions of their features (n, F).
-
-    How many groups there are is chosen by the mean silhouette (Rousseeuw 1987). They are apart if it is larger than
-    that of each reference, grouped likewise (after Tibshirani, Walther and Hastie 2001). It takes scikit-learn.
-    """
+    """Group failures by k-means over the directions of their features (n, F). How many groups there are is chosen by
+    the mean silhouette (Rousseeuw 1987). They are apart if it is larger than that of each reference, grouped likewise
+    (after Tibshirani, Walther and Hastie 2001). It takes scikit-learn."""
     lengths = np.linalg.norm(features, axis=1, keepdims=True)
     points = features / np.maximum(lengths, 1e-12)
     count = min(DIMENSIONS, *points.shape)
     if len(points) < FEWEST:
         return Clusters((tuple(range(len(points))),), None, False)
-    points = import_library("sklearn.decomposition").PCA(count, random_state=0).fit_transform(points)
+    points = rules.import_library("sklearn.decomposition").PCA(count, random_state=0).fit_transform(points)
     generator = np.random.default_rng(seed)
     score, found = _grouped(points)
     spread = points.std(axis=0)
@@ -297,8 +282,8 @@ def _grouped(points: NDArray[np.float64]) -> tuple[float, NDArray[np.int64]]:
     best = (-1.0, np.zeros(len(points), dtype=np.int64))
     distinct = len(np.unique(points.round(9), axis=0))
     for k in range(2, min(MOST, distinct - 1) + 1):
-        groups = import_library("sklearn.cluster").KMeans(k, n_init=4, random_state=0).fit_predict(points)
-        score = float(import_library("sklearn.metrics").silhouette_score(points, groups))
+        groups = rules.import_library("sklearn.cluster").KMeans(k, n_init=4, random_state=0).fit_predict(points)
+        score = float(rules.import_library("sklearn.metrics").silhouette_score(points, groups))
         if score > best[0]:
             best = score, groups
     return best

@@ -44,9 +44,6 @@ rendered so that enough of it is left."""
 OUTER = ("object", "environment", "model")
 
 
-# ---- rows -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class AskedSweep:
     """One of the sweeps whose rows are read."""
@@ -93,23 +90,17 @@ def read_predictions(sweeps: Sequence[AskedSweep]) -> pd.DataFrame:
 
 
 def values_of(rows: pd.DataFrame, place: int) -> dict[str, float | str]:
-    """Return what a row has, by parameter."""
     known = rows.loc[place, list(rows.attrs["units"])].dropna().items()
     return {name: value if isinstance(value, str) else float(value) for name, value in known}
-
-
-# ---- sweeps to make -------------------------------------------------------------------------------------------------
 
 
 def sweep_inside(
     config: SweepConfig, table: pd.DataFrame, conditions: RuleConditions, samples: int, seed: int, arc: int = 0
 ) -> SweepConfig:
-    """Return a sweep like another, of about so many configurations, most of which lie under the conditions.
-
-    Ranges of what is drawn are cut to the conditions, as far as the rows went; axes of a grid to the values that the
-    rows have there; names to those that are left. Of an angle that may lie on either side it is the side with the
-    number `arc`. What cannot be cut has to be left out by whoever counts.
-    """
+    """Return a sweep like another, of about so many configurations, most of which lie under the conditions. Ranges of
+    what is drawn are cut to the conditions, as far as the rows went; axes of a grid to the values that the rows have
+    there; names to those that are left. Of an angle that may lie on either side it is the side with the number `arc`.
+    What cannot be cut has to be left out by whoever counts."""
     inside = table[covered(conditions, table)]
     left = {name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]}
     grid: dict[str, Any] = {name: left.get(name, values) for name, values in config.grid.items()}
@@ -118,16 +109,13 @@ def sweep_inside(
         if name in left and outer[name] is not None:
             outer[name] = ",".join(like for value in left[name] for like in _like(config, name, value)) or outer[name]
 
-    def size(values: object) -> int:
-        return len(values) if isinstance(values, list) else 1
-
     others = math.prod(len(split_names(names)) if names else 1 for names in outer.values())
-    while grid and math.prod(map(size, grid.values())) * others > 2 * samples:
-        longest = max(grid, key=lambda name: size(grid[name]))
-        if size(grid[longest]) < 2:
-            break
+    sizes = {name: len(values) if isinstance(values, list) else 1 for name, values in grid.items()}
+    while math.prod(sizes.values()) * others > 2 * samples and max(sizes.values(), default=1) > 1:
+        longest = max(sizes, key=sizes.__getitem__)
         grid[longest] = grid[longest][::2]
-    points = math.prod(map(size, grid.values())) * others
+        sizes[longest] = len(grid[longest])
+    points = math.prod(sizes.values()) * others
     controls = {name: dict(given) for name, given in config.controls.items()}
     for condition in conditions:
         factor, arcs = condition.factor, condition.arcs
@@ -135,8 +123,16 @@ def sweep_inside(
         if condition.options is None and is_drawn(config, factor):
             low, high = max(condition.low, float(table[factor].min())), min(condition.high, float(table[factor].max()))
             low, high = arcs[arc % len(arcs)] if condition.turn else (low, high)
-            if high <= _declared(config, name)[parameter].high:
-                controls[name] = {**_ranges(config, name, table), **controls[name], parameter: [low, high]}
+            declared = _declared(config, name) or {}
+            if high > declared[parameter].high:
+                continue
+            # with a range for one parameter, the others would stay: they get what their rows have
+            for other in declared if not declared.keys() & config.controls[name].keys() else ():
+                column = table.get(f"{name}.{other}")
+                if column is not None and other not in controls[name] and is_drawn(config, f"{name}.{other}"):
+                    choices = {"choices": column.cat.categories.tolist()} if declared[other].options else None
+                    controls[name][other] = choices or [float(column.min()), float(column.max())]
+            controls[name][parameter] = [low, high]
     draws = math.ceil(samples / points) if controls else None
     return _quiet(config, grid=grid, controls=controls, samples=draws, seed=seed, **outer)
 
@@ -145,25 +141,22 @@ def is_drawn(config: SweepConfig, factor: str) -> bool:
     """Whether a sweep draws a parameter by chance, from a range that it can be given."""
     name, dot, parameter = factor.partition(".")
     is_frame = bool(config.path) and parameter == "time"
-    return bool(dot) and not is_frame and factor not in config.grid and parameter in _declared(config, name)
+    known = name in config.controls and parameter in (_declared(config, name) or ())
+    return bool(dot) and not is_frame and factor not in config.grid and known
 
 
-def _declared(config: SweepConfig, name: str) -> dict[str, Parameter]:
-    given = config.controls.get(name)
-    kind = None if given is None else CONTROLS.get(str(given.get("kind", name.partition(":")[0])))
-    return {} if kind is None or kind.kind == BY_KEY else {one.name: one for one in kind.declared(given or {})}
+def can_be_given(config: SweepConfig, name: str) -> bool:
+    """Whether a sweep can be told a value of its rows; others follow from those, as `path.distance` from the time."""
+    instance, dot, parameter = name.partition(".")
+    declared = _declared(config, instance)
+    return not dot or declared is None or parameter in declared
 
 
-def _ranges(config: SweepConfig, name: str, table: pd.DataFrame) -> dict[str, Any]:
-    """What a control was given, or else what its rows have: with a range for one parameter, the others would stay."""
-    given, declared = dict(config.controls[name]), _declared(config, name)
-    if not declared.keys() & given.keys():
-        for parameter, spec in declared.items():
-            column = table.get(f"{name}.{parameter}")
-            if column is not None and is_drawn(config, f"{name}.{parameter}"):
-                choices = {"choices": column.cat.categories.tolist()} if spec.options else None
-                given[parameter] = choices or [float(column.min()), float(column.max())]
-    return given
+def _declared(config: SweepConfig, name: str) -> dict[str, Parameter] | None:
+    """The parameters of a control by their names; None where these are the scene's."""
+    given = config.controls.get(name, {})
+    kind = CONTROLS.get(str(given.get("kind", name.partition(":")[0])))
+    return None if kind is None or kind.kind == BY_KEY else {one.name: one for one in kind.declared(given)}
 
 
 def along(
@@ -194,16 +187,6 @@ def along(
     return _quiet(config, grid=grid, controls=controls, samples=None, seed=seed, **kept, **outer)
 
 
-def can_be_given(config: SweepConfig, name: str) -> bool:
-    """Whether a sweep can be told a value of its rows; others follow from those, as `path.distance` from the time."""
-    instance, dot, parameter = name.partition(".")
-    given = config.controls.get(instance, {})
-    kind = str(given.get("kind", instance.partition(":")[0]))
-    if not dot or kind == BY_KEY or kind not in CONTROLS:
-        return True
-    return parameter in {one.name for one in CONTROLS[kind].declared(given)}
-
-
 def _like(config: SweepConfig, name: str, value: str) -> list[str]:
     """Of the names that a sweep was given, those that its rows write so."""
     given = split_names(getattr(config, name)) if getattr(config, name) else ()
@@ -211,16 +194,9 @@ def _like(config: SweepConfig, name: str, value: str) -> list[str]:
 
 
 def _quiet(config: SweepConfig, **changes: object) -> SweepConfig:
-    """A sweep with nothing beside its rows."""
-    more: dict[str, object] = {"trials": 0, "verify_spp": None, "keep_pictures": "none", "aov": None, "surface": False}
-    known = {*SweepConfig.model_fields, "set"}
-    given = {name: value for name, value in {**more, **changes}.items() if name in known}
-    if not given.get("controls"):
-        given["sampler"] = "sobol"
-    return SweepConfig(**{**config.plain(), **given})
-
-
-# ---- what they say --------------------------------------------------------------------------------------------------
+    quiet = {"trials": 0, "verify_spp": None, "keep_pictures": "none", "aov": None, "surface": False}
+    sampler = {} if changes.get("controls") else {"sampler": "sobol"}
+    return SweepConfig(**{**config.plain(), **quiet, **changes, **sampler})
 
 
 @dataclass
@@ -286,9 +262,7 @@ class Renders:
 
     def pairs(self, rules: Sequence[CountedRule]) -> Iterator[NearestRight]:
         """The nearest right configurations to typical failures, along the parameters of their rule or else the others.
-
-        A failure that no parameter alone puts right has none.
-        """
+        A failure that no parameter alone puts right has none."""
 
         def moved(pair: NearestRight) -> float:
             """How far the value moved, as a share of what the rows have; another name is as far as it goes."""
@@ -390,7 +364,6 @@ class Renders:
 
 
 def beyond(rules: Sequence[RuleConditions], rows: pd.DataFrame) -> Mask:
-    """Return which rows (n,) no rule covers."""
     left = np.ones(len(rows), np.bool_)
     for one in rules:
         left &= ~covered(one, rows)
@@ -399,11 +372,8 @@ def beyond(rules: Sequence[RuleConditions], rows: pd.DataFrame) -> Mask:
 
 def typical_failures(table: pd.DataFrame, rules: Sequence[CountedRule], most: int) -> list[tuple[int, RuleConditions]]:
     """Return the places of at most so many failures with the conditions of the rule that they are under, the most
-    typical first.
-
-    Rules take turns, a row belongs to the first that covers it, and what fails under none of them is the last to take
-    one. Of each the failure nearest to the middle of its failures, by ranks, comes first.
-    """
+    typical first. Rules take turns, a row belongs to the first that covers it, and what fails under none of them is the
+    last to take one. Of each the failure nearest to the middle of its failures, by ranks, comes first."""
     columns = (table[name] for name in table.attrs["units"])
     numbers = [one.cat.codes if one.dtype == "category" else one for one in columns]
     ranks = np.stack(numbers, axis=1).astype(np.float64).argsort(axis=0).argsort(axis=0) / len(table)

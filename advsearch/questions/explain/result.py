@@ -7,19 +7,9 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from advsearch.report import shown as showing
 from advsearch.report import wording
-from advsearch.report.shown import (
-    Claim,
-    Column,
-    Extent,
-    Picture,
-    ResultPart,
-    ShownResult,
-    claim,
-    counted,
-    nothing_claimed,
-    share_text,
-)  # fmt: skip
+from advsearch.report.shown import Claim, Column, Picture, ResultPart, ShownResult, claim, counted, share_text
 from advsearch.report.wording import conditions_text, interval_text, percent, share_of_text
 from advsearch.runs.results import ConditionRow, Fields, Interval, JsonFloat, RunResult
 
@@ -143,7 +133,6 @@ class ExplainResult(RunResult, RightOf):
 
     @property
     def brief(self) -> str:
-        """How many rules there are."""
         return f"{len(self.rules)} rules over {self.total} rows"
 
 
@@ -162,7 +151,6 @@ MOST_PREDICTIONS = 3  # Predictions of a cluster that are named
 
 
 def shown(result: ExplainResult) -> ShownResult:
-    """Return the rules, what decides, the envelope, and failures beside the nearest right predictions."""
     said = f"{wording.count(len(result.rules), 'rule')} under which the model is wrong more often than elsewhere."
     if not result.rules:
         said = (
@@ -202,7 +190,6 @@ def shown(result: ExplainResult) -> ShownResult:
 
 
 def rule_text(number: int, rule: RuleRow) -> str:
-    """Return the rule with a number, from 1, as a sentence."""
     rest = "elsewhere" if number == 1 else "in what no rule before covers"
     text = f"{conditions_text(rule.conditions)}: right in {rule.text}; {rest} {rule.elsewhere.text}."
     if rule.confirmed is None:
@@ -228,7 +215,6 @@ def not_told_text(result: ExplainResult) -> str:
 
 
 def envelope_text(result: ExplainResult) -> str:
-    """Return what the envelope promises."""
     box = result.envelope
     if box is None:
         return "No box of enough rows promises the accuracy that was asked for."
@@ -264,21 +250,17 @@ def _kinds(found: FailureClusters) -> ResultPart:
 
 
 def claims(result: ExplainResult) -> Iterator[Claim]:
-    """Yield what the rules and the envelope stand for."""
-
-    def right_of(of: RightOf, what: str) -> Extent:
-        return counted(f"right, of {what}", of.right, of.total, of.interval)
-
     for number, rule in enumerate(result.rules, 1):
         how = "fresh renders" if rule.confirmed else "rows that did not choose the rule"
-        extent = right_of(rule.confirmed or rule, how)
+        of = rule.confirmed or rule
+        extent = counted(f"right, of {how}", of.right, of.total, of.interval)
         text = f"Where {conditions_text(rule.conditions)} (rule {number}) the model is right in {share_text(extent)}"
         yield claim("measured", f"{text} {how}; elsewhere in {rule.elsewhere.text}.", extent)
     box = result.envelope
     if box is not None and box.held and box.total:
-        extent = right_of(box, "rows that did not choose the box")
+        extent = counted("right, of rows that did not choose the box", box.right, box.total, box.interval)
         text = f"Inside {conditions_text(box.conditions)} the model is right in {share_text(extent)} configurations"
         yield claim("measured", f"{text} that did not choose this box; the sweeps drew no others.", extent)
     elif not result.rules:
         why = "no box of values was shown to keep the accuracy that was asked for"
-        yield nothing_claimed(why, envelope_text(result))
+        yield showing.nothing_claimed(why, envelope_text(result))

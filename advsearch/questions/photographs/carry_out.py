@@ -212,7 +212,7 @@ def _by_sweep(config: SweepConfig) -> list[_PhotoJudge]:
         task = job.tasks[model]
         if rendering is None or not (task.varies or task.calibrates):
             place = next((place for place in job.places if place.object == name), job.places[0])
-            return job.truth(place, model, {})
+            return task.truth(job.facts(place, {}))
         number = int(rendering)
         if number >= job.per_scene * len(job.places):
             raise InputError(f"rendering: the sweep has no picture {rendering}; it belongs to another run")

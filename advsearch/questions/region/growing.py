@@ -26,7 +26,7 @@ from advsearch.questions.attack.outcome import transport_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.region.result import AxisRange, BoxSide, GrownRegion, MarginMap, RegionConfig, RegionResult
 from advsearch.questions.sweep.predicting import pays_from
-from advsearch.report.figures import MARGIN, Figures, axis_title, figure_of, heat
+from advsearch.report.figures import MARGIN, axis_title, figure_of, heat
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.summary import read_configuration
@@ -56,7 +56,6 @@ class Varied:
 
 
 def region_around(asked: Asked[RegionConfig]) -> RegionResult:
-    """Grow the region that a configuration describes."""
     config, stages = asked.config, Stages(asked.progress)
     stages.begin("setup", LOADING)
     budget: dict[str, object] = {}
@@ -136,10 +135,8 @@ def _light(verifier: Verifier, config: RegionConfig, varied: Varied) -> SurfaceL
     moved = surface_renderer.varied(problem.renderer, varied.groups)
     if not config.specialise or not moved & CAMERAS or not moved <= FREE:
         return None
-    wanted = USUAL * len(varied.names) + config.map**2
-    least = pays_from(problem.renderer, findings.spp)
-    reason = surface_renderer.why_not_kept(problem.renderer)
-    if reason is None and wanted < least:
+    reason, least = surface_renderer.why_not_kept(problem.renderer), pays_from(problem.renderer, findings.spp)
+    if reason is None and USUAL * len(varied.names) + config.map**2 < least:
         reason = f"light on surfaces pays from {least} pictures on"
     if reason is None:
         stages.begin("transport", "finding the light on surfaces", LIGHTS, hint="`specialise=false` leaves it out")
@@ -230,6 +227,7 @@ def _number(described: Any, number: str) -> float:
 def _map(
     verifier: Verifier, side: int, varied: Varied, box: Sequence[BoxSide], run: RunDirectory, light: SurfaceLight | None
 ) -> MarginMap:
+    """Draw the margin over two parameters, with the line at which the verdict changes, and the box."""
     hint = f"{side * side} pictures of {verifier.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
     verifier.stages.begin("map", "drawing the map", side * side, hint=hint)
     steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
@@ -239,33 +237,27 @@ def _map(
         margins += [-trial.score for trial in verifier.trials("map", places, sought=False, predictor=light)]
     rows = [margins[begin : begin + side] for begin in range(0, len(margins), side)]
     ends = [verifier.problem.describe(varied.at(torch.full((2,), end))) for end in (0.0, 1.0)]
-    axes = []
+    ranges = []
     for grown in box:
         low, high = (_number(end[grown.name], "") for end in ends) if grown.name in ends[0] else (0.0, 1.0)
-        axes.append(AxisRange(name=grown.name, unit=grown.unit, low=low, high=high))
-    drawn = MarginMap(axes=(axes[0], axes[1]), margins=rows)
-    for suffix, data in map_figure(drawn, box).items():
-        write_bytes(run.path / "images" / f"map.{suffix}", data)
-    return drawn
-
-
-def map_figure(drawn: MarginMap, box: Sequence[BoxSide]) -> Figures:
-    """Draw a map of the margin over two parameters, with the line at which the verdict changes, and the box."""
+        ranges.append(AxisRange(name=grown.name, unit=grown.unit, low=low, high=high))
+    first, second = ranges
+    across, up = box
 
     def draw(axes: Any) -> None:
-        (first, second), margins = drawn.axes, drawn.margins
         extent = (first.low, first.high, second.low, second.high)
-        heat(axes, margins, extent, MARGIN, axis_title(first.name, first.unit), axis_title(second.name, second.unit))
-        if min(map(min, margins)) < 0.0 < max(map(max, margins)):
-            axes.contour(margins, levels=[0.0], extent=extent, colors="black", linewidths=1.0)
-        across, up = box
+        heat(axes, rows, extent, MARGIN, axis_title(first.name, first.unit), axis_title(second.name, second.unit))
+        if min(margins) < 0.0 < max(margins):
+            axes.contour(rows, levels=[0.0], extent=extent, colors="black", linewidths=1.0)
         corners_x = [across.low, across.high, across.high, across.low, across.low]
         corners_y = [up.low, up.low, up.high, up.high, up.low]
         axes.plot(corners_x, corners_y, color="black", linestyle="--", label="region")
         axes.plot(across.centre, up.centre, "k+", label="centre")
         axes.legend(loc="upper right", frameon=True)
 
-    return figure_of(draw, (6.0, 4.6))
+    for suffix, data in figure_of(draw, (6.0, 4.6)).items():
+        write_bytes(run.path / "images" / f"map.{suffix}", data)
+    return MarginMap(axes=(first, second), margins=rows)
 
 
 Same = Callable[[Tensor, int], bool]
@@ -291,7 +283,6 @@ class GrownBox:
 
     @property
     def volume(self) -> float:
-        """Share of the unit box that it takes up."""
         return float((self.high - self.low).prod())
 
 
@@ -300,6 +291,7 @@ PROBES = 8  # Random points at which what a face would win is probed
 USUAL, MOST_PROBED = 100, 400
 """Pictures of growing for each parameter, usually and at most: that is more than twice what boxes, balls, planes and
 noise have taken."""
+SHORTEST = 1e-3  # A face does not move by less
 
 
 def grow(
@@ -318,76 +310,57 @@ def grow(
         raise InputError(f"samples: expected at least 1, got {samples}")
     if not bool(((centre >= 0.0) & (centre <= 1.0)).all()):
         raise InputError("the centre of a region has to lie inside the ranges of its parameters")
-    judge = _Judge(same, seed)
     low, high = centre.clone(), centre.clone()
-    share, faces = 0.5, range(2 * centre.numel())
-    last = MOST_PROBED * centre.numel() - len(faces) * PROBES
+    judged = drawn = 0
+
+    def holds(u: Tensor) -> bool:
+        nonlocal judged
+        judged += 1
+        return same(u, judged - 1)
+
+    def points(bottom: Tensor, top: Tensor, number: int) -> Tensor:
+        """(number, d) uniform in a box, other ones at every call."""
+        nonlocal drawn
+        generator = torch.Generator().manual_seed(seeds.stream(seed, "region", drawn))
+        drawn += 1
+        return torch.lerp(bottom, top, torch.rand(number, len(centre), generator=generator))
+
+    def push(face: int, share: float) -> bool:
+        """Move a face out if the slab that it wins has the centre's prediction; whether it moved."""
+        axis, up = divmod(face, 2)
+        room = float(1.0 - high[axis] if up else low[axis])
+        step = room if room < 4.0 * SHORTEST else share * room
+        if room <= 0.0 or (step < SHORTEST and step != room):
+            return False
+        bottom, top = low.clone(), high.clone()
+        if up:
+            bottom[axis], top[axis] = high[axis], high[axis] + step
+        else:
+            bottom[axis], top[axis] = low[axis] - step, low[axis]
+        probes = points(bottom, top, PROBES)
+        probes[0, axis] = outer = top[axis] if up else bottom[axis]
+        if not all(holds(point) for point in probes):
+            return False
+        (high if up else low)[axis] = outer.clamp(0.0, 1.0)
+        return True
+
+    share, faces = 0.5, range(2 * len(centre))
+    last = MOST_PROBED * len(centre) - len(faces) * PROBES
     for _ in range(LEVELS):
-        while judge.count <= last and any([_push(judge, low, high, face, share) for face in faces]):
+        while judged <= last and any([push(face, share) for face in faces]):
             pass
         share /= 2.0
     for attempt in range(ATTEMPTS):
         on_check()
-        points = judge.points(low, high, samples)
-        wrong = points[[not judge(point) for point in points]]
+        tried = points(low, high, samples)
+        wrong = tried[[not holds(point) for point in tried]]
         if len(wrong) == 0 or attempt == ATTEMPTS - 1:
             break
-        for point in wrong:
-            _cut(low, high, centre, point)
-    return GrownBox(centre, low, high, samples - len(wrong), samples, judge.count)
-
-
-@dataclass
-class _Judge:
-    """Counts what it judges; every call has a seed of its own."""
-
-    same: Same
-    seed: int
-    count: int = 0
-    drawn: int = 0
-
-    def __call__(self, u: Tensor) -> bool:
-        self.count += 1
-        return self.same(u, self.count - 1)
-
-    def points(self, low: Tensor, high: Tensor, number: int) -> Tensor:
-        """(number, d) uniform in a box, other ones at every call."""
-        generator = torch.Generator().manual_seed(seeds.stream(self.seed, "region", self.drawn))
-        self.drawn += 1
-        return torch.lerp(low, high, torch.rand(number, low.numel(), generator=generator))
-
-
-SHORTEST = 1e-3  # A face does not move by less
-
-
-def _push(judge: _Judge, low: Tensor, high: Tensor, face: int, share: float) -> bool:
-    """Move one face out if the slab that it wins has the centre's prediction; whether it moved."""
-    axis, up = divmod(face, 2)
-    room = float(1.0 - high[axis] if up else low[axis])
-    step = room if room < 4.0 * SHORTEST else share * room
-    if room <= 0.0 or (step < SHORTEST and step != room):
-        return False
-    bottom, top = low.clone(), high.clone()
-    if up:
-        bottom[axis], top[axis] = high[axis], high[axis] + step
-    else:
-        bottom[axis], top[axis] = low[axis] - step, low[axis]
-    points = judge.points(bottom, top, PROBES)
-    points[0, axis] = outer = top[axis] if up else bottom[axis]
-    if not all(judge(point) for point in points):
-        return False
-    face_at = high if up else low
-    face_at[axis] = outer.clamp(0.0, 1.0)
-    return True
-
-
-def _cut(low: Tensor, high: Tensor, centre: Tensor, point: Tensor) -> None:
-    """Move in the face that takes the least of the box away so that the point lies outside; the centre stays inside."""
-    if bool(((point < low) | (point > high)).any()):
-        return
-    width = (high - low).clamp_min(1e-12)
-    loss = torch.where(point > centre, (high - point) / width, (point - low) / width)
-    loss = torch.where(point == centre, torch.inf, loss)
-    axis = int(loss.argmin())
-    face = high if point[axis] > centre[axis] else low
-    face[axis] = torch.lerp(centre[axis], point[axis], 0.98)
+        for point in wrong:  # the face that takes the least of the box away moves in, so that the point lies outside
+            if bool(((point >= low) & (point <= high)).all()):
+                width = (high - low).clamp_min(1e-12)
+                loss = torch.where(point > centre, (high - point) / width, (point - low) / width)
+                axis = int(torch.where(point == centre, torch.inf, loss).argmin())  # the centre stays inside
+                face = high if point[axis] > centre[axis] else low
+                face[axis] = torch.lerp(centre[axis], point[axis], 0.98)
+    return GrownBox(centre, low, high, samples - len(wrong), samples, judged)

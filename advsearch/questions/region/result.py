@@ -11,16 +11,8 @@ from advsearch.config import DerivativeConfig, SceneConfig
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.shown import Claim, Column, InNotebook, ResultPart, ShownResult, claim, counted, share_text
 from advsearch.report.wording import percent
-from advsearch.runs.results import (
-    CleanScene,
-    Fields,
-    Formation,
-    Interval,
-    JsonFloat,
-    LinearTransport,
-    SceneResult,
-    having,
-)
+from advsearch.runs import results
+from advsearch.runs.results import Fields, Interval, JsonFloat, SceneResult
 from advsearch.settings import setting, setting_as_in
 
 FEWEST_SAMPLES = 8
@@ -34,38 +26,29 @@ class RegionConfig(SceneConfig):
     command: ClassVar[str] = "region"
     without: ClassVar[tuple[str, ...]] = ("spp",)
 
+    # fmt: off
     around: str | None = setting(
-        None,
-        "region",
+        None, "region",
         "a run whose adversarial configuration is the centre; it brings scene, model and controls with it",
-        "the name or the folder of a run",
-        otherwise="the scene as it is",
+        "the name or the folder of a run", otherwise="the scene as it is",
     )
     vary: str | None = setting(
-        None,
-        "region",
-        "the parameters in which the box grows, separated by commas",
-        "names such as pose.yaw,camera.elevation",
-        otherwise="all that the controls search, up to eight",
+        None, "region", "the parameters in which the box grows, separated by commas",
+        "names such as pose.yaw,camera.elevation", otherwise="all that the controls search, up to eight",
     )
     samples: int = setting(
         200, "region", "fresh samples that check the box", unit="renders", ge=FEWEST_SAMPLES, le=1_000_000
     )
     map: int = setting(
-        0,
-        "region",
-        "side of the map of the margin, where there are two parameters; 0 for none",
-        unit="points",
-        ge=0,
-        le=512,
+        0, "region", "side of the map of the margin, where there are two parameters; 0 for none", unit="points",
+        ge=0, le=512,
     )
     specialise: bool = setting_as_in(
-        DerivativeConfig,
-        "specialise",
-        group="region",
+        DerivativeConfig, "specialise", group="region",
         description="predict pictures from new viewpoints while the box grows, and those of the map",
         switched="render every picture",
     )
+    # fmt: on
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", group="region", description="samples per pixel")
 
 
@@ -112,24 +95,22 @@ class RegionResult(InNotebook, GrownRegion, SceneResult):
 
     command: ClassVar[str] = "region"
 
-    image_formation: Formation
-    clean: CleanScene
+    image_formation: results.Formation
+    clean: results.CleanScene
     warnings: list[str] = Field(description="sentences that a reader has to know")
-    transport: LinearTransport | None = Field(
+    transport: results.LinearTransport | None = Field(
         default=None, description="what predicted pictures from new viewpoints; absent where no camera moves"
     )
-    renders: Annotated[dict[str, int], having("verification")] = Field(
+    renders: Annotated[dict[str, int], results.having("verification")] = Field(
         description="of the `verification`: all that were rendered; of the `products`: all that were predicted"
     )
 
     @property
     def brief(self) -> str:
-        """How sure the verdict is."""
         return f"{self.verdict} in {self.same} of {self.samples} samples of the box" if self.samples else ""
 
 
 def shown(result: RegionResult) -> ShownResult:
-    """Return the box and what is known of it."""
     if result.box is None or result.interval is None:
         return ShownResult("Stopped before the box was known.")
     box: Mapping[str, Column] = {
@@ -148,7 +129,6 @@ def shown(result: RegionResult) -> ShownResult:
 
 
 def claims(result: RegionResult) -> Iterator[Claim]:
-    """Yield in how much of the box the verdict stays."""
     if not result.samples or result.same is None or result.interval is None or result.verdict is None:
         return
     extent = counted(f"samples that are {result.verdict}", result.same, result.samples, result.interval)

@@ -3,7 +3,7 @@ pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -31,11 +31,10 @@ from advsearch.runs.directory import RunDirectory, find_run, only_here
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import MADE_WITH, changed_file
 from advsearch.scene.cycles import BlenderError, Cycles
-from advsearch.scene.renderer import MAX_SPP
+from advsearch.scene.renderer import MAX_SPP, Renderer
 
 OWN = "as verified"  # The way in which nothing is changed
 OWN_LIGHT = "own"  # What conditions share whose pictures come of the radiance that the run itself would render
-
 QUALITIES = (90, 75, 50)
 
 SENSORS: dict[str, dict[str, float]] = {
@@ -45,101 +44,90 @@ SENSORS: dict[str, dict[str, float]] = {
     },
 }  # fmt: skip
 """Values of the control `sensor`, by what they stand for; those that are not named are 0."""
-
 CURVES = {"gamma": "a power of 1/2.2 in place of sRGB", "reinhard": "highlights rolled off, x / (1 + x)"}
 """Other tone curves, by `ImageFormation.transfer`."""
+OWN_MODEL = "the run's own"  # What no other model is called
 SHORT, LONG = 2, 16  # Longest light paths in segments: direct light alone, and far more than a run renders
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Way:
-    """One condition of a replay.
-
-    Attributes:
-        name: what is changed.
-        text: to what.
-        make: makes the condition anew, under its title; it holds a scene of its own where it has to.
-        shares: whether it takes the radiance of the first condition, so that it costs no renders beside that.
-        missing: why it cannot be had; empty where it can.
-    """
+    """One condition of a replay: what is changed and to what; the problem under it, made anew, as it may hold a scene
+    of its own; and why it cannot be had, empty where it can. The others are as those of `RetrialCondition`, by default
+    with pictures of its own."""
 
     name: str
     text: str
-    make: Callable[[str], RetrialCondition]
-    shares: bool = False
+    problem: Callable[[], Problem]
+    spp: int
+    light: Hashable = None
+    source: Hashable = None
+    change: Callable[[Tensor, int], Tensor] | None = None
     missing: str = ""
 
     def condition(self) -> RetrialCondition:
-        """Return the condition."""
-        return self.make(self.text if self.name == OWN else f"{self.name}: {self.text}")
+        title = self.text if self.name == OWN else f"{self.name}: {self.text}"
+        return RetrialCondition(title, self.problem(), self.spp, self.source or title, self.change, self.light)
 
 
 def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Problem]) -> Iterator[Way]:
-    """Yield every condition of a problem's configuration but other models; the first changes nothing.
-
-    `spp` is that of the run's verification, and `sized` makes the same problem at another (height, width) in pixels.
-    """
+    """Yield every condition of a problem's configuration but other models; the first changes nothing. `spp` is that of
+    the run's verification, and `sized` makes the same problem at another (height, width) in pixels."""
     renderer = problem.renderer
     scene, formation = renderer.scene, renderer.formation
 
-    def same(count: int = spp, **changed: Any) -> Callable[..., RetrialCondition]:
-        return lambda name: RetrialCondition(name, problem, count, OWN_LIGHT, light=OWN_LIGHT, **changed)
+    def same(name: str, text: str, count: int = spp, change: Callable[[Tensor, int], Tensor] | None = None) -> Way:
+        return Way(name, text, lambda: problem, count, OWN_LIGHT, OWN_LIGHT, change)
 
-    def other(**made: Any) -> Callable[..., RetrialCondition]:
+    def traced(name: str, text: str, **made: Any) -> Way:
         sampler = {"sampler": made["sampler"]} if "sampler" in made else {}
-        return lambda name: RetrialCondition(
-            name, replace(problem, renderer=renderer.like(scene.like(**made), **sampler)), spp, name
-        )
+        return Way(name, text, lambda: replace(problem, renderer=renderer.like(scene.like(**made), **sampler)), spp)
 
-    def formed(light: str | None = None, **fields: Any) -> Callable[..., RetrialCondition]:
-        changed = replace(problem, renderer=renderer.like(**fields))
-        return lambda name: RetrialCondition(name, changed, spp, name, light=light)
+    def formed(name: str, text: str, light: str | None = None, **fields: Any) -> Way:
+        return Way(name, text, lambda: replace(problem, renderer=renderer.like(**fields)), spp, light)
 
-    def at(size: tuple[int, int]) -> Callable[..., RetrialCondition]:
-        return lambda name: RetrialCondition(name, sized(size), spp, name)
-
-    yield Way(OWN, OWN, same(), shares=True)
+    yield same(OWN, OWN)
     for count in (max(1, spp // 4), min(MAX_SPP, 4 * spp)):
         if count != spp:
-            yield Way("samples", f"{count} a pixel", same(count))
+            yield same("samples", f"{count} a pixel", count)
     height, width = formation.resolution
     for size in ((max(8, height // 2), max(8, width // 2)), (min(4096, 2 * height), min(4096, 2 * width))):
         if size != (height, width):
-            yield Way("resolution", f"{size[0]} x {size[1]} pixels", at(size))
+            yield Way("resolution", f"{size[0]} x {size[1]} pixels", partial(sized, size), spp)
     for depth in (SHORT, LONG):
         if depth != scene.max_depth:
-            yield Way("depth", f"light paths of {depth} segments", other(max_depth=depth))
+            yield traced("depth", f"light paths of {depth} segments", max_depth=depth)
     if not scene.volumetric:
-        yield Way("integrator", "Mitsuba's path in place of prb", other(integrator="path"))
+        yield traced("integrator", "Mitsuba's path in place of prb", integrator="path")
     sampler = "independent" if formation.sampler != "independent" else "multijitter"
-    yield Way("sampler", sampler, other(sampler=sampler))
+    yield traced("sampler", sampler, sampler=sampler)
     denoiser = "none" if formation.denoiser != "none" else "oidn"
-    yield Way("denoiser", denoiser, formed(denoiser=denoiser))
+    yield formed("denoiser", denoiser, denoiser=denoiser)
     for curve, text in CURVES.items():
-        yield Way("curve", f"{curve}, {text}", formed(OWN_LIGHT, transfer=curve), shares=True)
+        yield formed("curve", f"{curve}, {text}", OWN_LIGHT, transfer=curve)
     for quality in QUALITIES:
-        yield Way("jpeg", f"quality {quality}", same(change=_file(quality)), shares=True)
+        yield same("jpeg", f"quality {quality}", change=partial(_file, quality))
     for name, values in SENSORS.items():
-        yield Way("sensor", name, same(change=_sensor(values)), shares=True)
+        full = {one.name: torch.tensor(values.get(one.name, 0.0)) for one in SensorControl.parameters}
+        yield same("sensor", name, change=partial(_sensed, full))
 
-    def by_blender(name: str) -> RetrialCondition:
-        return RetrialCondition(name, replace(problem, renderer=renderer.like(source=made.radiance)), spp, "blender")
+    def by_blender() -> Problem:
+        return replace(problem, renderer=renderer.like(source=cycles.radiance))
 
     denoise, missing = formation.denoiser != "none", ""
     try:
-        made = Cycles(scene.made[0], formation.resolution, max_depth=scene.max_depth, denoise=denoise)
+        cycles = Cycles(scene.made[0], formation.resolution, max_depth=scene.max_depth, denoise=denoise)
     except BlenderError as error:
         missing = str(error)
-    yield Way("blender", "Cycles, Blender's renderer", by_blender, missing=missing)
+    yield Way("blender", "Cycles, Blender's renderer", by_blender, spp, missing=missing)
 
 
-def _file(quality: int) -> Callable[[Tensor, int], Tensor]:
-    return lambda picture, seed: coded(picture, quality).clamp(0.0, 1.0)
+def _file(quality: int, picture: Tensor, _seed: int) -> Tensor:
+    return coded(picture, quality).clamp(0.0, 1.0)
 
 
-def _sensor(values: dict[str, float]) -> Callable[[Tensor, int], Tensor]:
-    full = {one.name: torch.tensor(values.get(one.name, 0.0)) for one in SensorControl.parameters}
-    return lambda picture, seed: through_sensor(picture, full, seed)
+def _sensed(values: Mapping[str, Tensor], picture: Tensor, seed: int) -> Tensor:
+    return through_sensor(picture, values, seed)
 
 
 @asks(ReplayConfig)
@@ -162,11 +150,9 @@ def replay(attack: str | Path | AttackResult, *, progress: Watched = None, **set
 
 def rendered_again(asked: Asked[ReplayConfig], parts: AttackParts | None = None) -> ReplayResult:
     """Render an adversarial scene again as a configuration describes; every trial is stored at once, and a run goes on
-    with the next. `parts` is what the attack was asked with; None loads what its run names.
-
-    Raises InputError where the run has no adversarial configuration, or its scene is another one now, and
-    FileFormatError where it did not end, or is of another command.
-    """
+    with the next. `parts` is what the attack was asked with; None loads what its run names. Raises InputError where the
+    run has no adversarial configuration, or its scene is another one now, and FileFormatError where it did not end, or
+    is of another command."""
     config = asked.config
     asked.progress.stage(LOADING)
     folder = find_run(config.attack)
@@ -184,10 +170,16 @@ def rendered_again(asked: Asked[ReplayConfig], parts: AttackParts | None = None)
     u = kept_configuration(folder, problem)
     spp = summary.sample_count.spp if summary.sample_count else summary.verified.spp if summary.verified else 64
     own, *others = ways_of(problem, spp, lambda size: again(resolution=size)[0])
-    ways = [own, *(way for way in others if way.name in config.chosen), *_models(config, again, problem, spp)]
+    ways = [own, *(way for way in others if way.name in config.chosen)]
+    for name in config.models:  # those that are shown pictures as the run's own model is take its renders
+        other = again(model=name, ensemble=None)[0]
+        light = OWN_LIGHT if other.renderer.formation == problem.renderer.formation else name
+        other = replace(other, renderer=problem.renderer) if light == OWN_LIGHT else other
+        ways.append(Way("model", name, partial(replace, other), spp, light, light))
     table = _Table(u, config.trials, seeds.stream(parts.config.seed, "replay"), asked.run, asked.progress)
+    together = [way for way in ways if way.light == OWN_LIGHT and way.spp == spp]
     with asked.until_interrupted():
-        for batch in ([way for way in ways if way.shares], *([way] for way in ways if not way.shares)):
+        for batch in (together, *([way] for way in ways if way not in together)):
             table.fill(batch)
     return asked.result(
         ReplayResult,
@@ -220,24 +212,17 @@ class _Table:
     def fill(self, ways: Sequence[Way]) -> None:
         """Add the rows of some conditions that share their renders: the clean scene under all of them, then the
         adversarial one. A condition that cannot be had, or that Blender fails at, gets a row that says why."""
-        missing = next((way.missing for way in ways if way.missing), "")
+        renderers, before = list[Renderer](), 0
         try:
-            if not missing:
-                self._try(ways)
-        except BlenderError as error:
-            missing = str(error)
-        for way in ways if missing else ():
-            self.rows[way] = ReplayRow(way=way.name, condition=way.text, ending=NOT_DONE, reason=missing)
-
-    def _try(self, ways: Sequence[Way]) -> None:
-        text = ", ".join(dict.fromkeys(way.name for way in ways)) + (f": {ways[0].text}" if len(ways) == 1 else "")
-        total = 2 * self.trials * len(ways)
-        self.progress.stage(f"replaying, {text}", total, hint="`trials` or `ways` shorten it")
-        conditions = {way: way.condition() for way in ways}
-        renderers = {id(one.problem.renderer): one.problem.renderer for one in conditions.values()}.values()
-        before = sum(renderer.renders for renderer in renderers)
-        retrials = Retrials([*conditions.values()], self.run, self.progress, trials=self.trials, seed=self.seed)
-        try:
+            if missing := next((way.missing for way in ways if way.missing), ""):
+                raise BlenderError(missing)
+            text = ", ".join(dict.fromkeys(way.name for way in ways)) + (f": {ways[0].text}" if len(ways) == 1 else "")
+            total = 2 * self.trials * len(ways)
+            self.progress.stage(f"replaying, {text}", total, hint="`trials` or `ways` shorten it")
+            conditions = {way: way.condition() for way in ways}
+            renderers += {id(one.problem.renderer): one.problem.renderer for one in conditions.values()}.values()
+            before = sum(renderer.renders for renderer in renderers)
+            retrials = Retrials([*conditions.values()], self.run, self.progress, trials=self.trials, seed=self.seed)
             clean = {way: control_group(retrials.clean(one), one.spp) for way, one in conditions.items()}
             for way, condition in conditions.items():
                 checked = retrials.adversarial("answer", self.u, condition)
@@ -245,6 +230,9 @@ class _Table:
                 self.rows[way] = ReplayRow(
                     way=way.name, condition=way.text, ending=ending, clean=clean[way], verified=rate
                 )
+        except BlenderError as error:
+            for way in ways:
+                self.rows[way] = ReplayRow(way=way.name, condition=way.text, ending=NOT_DONE, reason=str(error))
         finally:
             self.renders += sum(renderer.renders for renderer in renderers) - before
 
@@ -256,23 +244,3 @@ def _changed(folder: Path, parts: AttackParts) -> list[str]:
     before = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
     name = changed_file(before, parts.config.plain())
     return [f"{name} is not what it was when the run was made: what does not hold may come from that."] if name else []
-
-
-Again = Callable[..., tuple[Problem, list[str]]]
-"""The problem of the run with some settings changed, and warnings; see `problem_of_parts`."""
-OWN_MODEL = "the run's own"  # What no other model is called
-
-
-def _models(config: ReplayConfig, again: Again, problem: Problem, spp: int) -> Iterator[Way]:
-    """Other models; those that are shown pictures as the run's own model is take its renders."""
-    for name in config.models:
-        other = again(model=name, ensemble=None)[0]
-        shares = other.renderer.formation == problem.renderer.formation
-        if shares:
-            other = replace(other, renderer=problem.renderer)
-        source = OWN_LIGHT if shares else name
-
-        def condition(title: str, other: Problem = other, source: str = source) -> RetrialCondition:
-            return RetrialCondition(title, other, spp, source, light=source)
-
-        yield Way("model", name, condition, shares)

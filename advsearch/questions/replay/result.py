@@ -37,12 +37,9 @@ class ReplayConfig(Config):
         None, "replay", "what is changed, separated by commas", f"some of {', '.join(WAYS)}", otherwise="all"
     )
     model: str | None = setting(
-        None,
-        "replay",
-        "other models that the scene is tried on, separated by commas",
-        "models as `attack` takes them",
+        None, "replay", "other models that the scene is tried on, separated by commas", "models as `attack` takes them",
         otherwise="none",
-    )
+    )  # fmt: skip
     trials: int = setting(
         REPLAY_TRIALS, "replay", "fresh renders under each condition", unit="renders", ge=FEWEST_TRIALS, le=100_000
     )
@@ -62,17 +59,14 @@ class ReplayConfig(Config):
 
     @property
     def chosen(self) -> tuple[str, ...]:
-        """What is changed."""
         return WAYS if self.ways is None else split_names(self.ways)
 
     @property
     def models(self) -> tuple[str, ...]:
-        """The other models."""
         return () if self.model is None else split_names(self.model)
 
     @property
     def title(self) -> tuple[str, ...]:
-        """The run, and what is asked of it."""
         return Path(self.attack).name, self.command
 
 
@@ -109,7 +103,6 @@ class ReplayResult(InNotebook, SceneResult):
 
     @property
     def brief(self) -> str:
-        """Under how many conditions it holds."""
         done = [row for row in self.table if row.ending != NOT_DONE]
         return f"holds under {sum(row.ending == 'found' for row in done)} of {len(done)}"
 
@@ -118,20 +111,24 @@ HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % inter
 
 
 def shown(result: ReplayResult) -> ShownResult:
-    """Return the table of conditions."""
     note = (
         "Trials with fresh seeds, the same under every condition, rounded to 8 bits, with 95 % Clopper-Pearson "
         "intervals. A success is what the search sought, where the clean scene is right with the same seed under the "
         "same condition."
     )
-    rows = [[row.way, "" if row.way == row.condition else row.condition, *_rates(row)] for row in result.table]
+    rows = []
+    for row in result.table:
+        told = ["", "", "", "", f"{NOT_DONE}: {row.reason}"]
+        if row.clean is not None and row.verified is not None:
+            verdict = {"found": "holds", "already wrong": "clean is wrong too"}.get(row.ending, "does not hold")
+            told = [*wording.rated_cells(row.clean), *wording.rated_cells(row.verified), verdict]
+        rows.append([row.way, "" if row.way == row.condition else row.condition, *told])
     table = ResultPart("Under other conditions", heads=HEADS, rows=rows, note=note)
     about = [f"{PurePath(result.answer).name} ({result.answered})", result.object, ", ".join(result.controls)]
     return ShownResult(replay_text(result), [table], {"attack": result.answer, "model": result.model}, about)
 
 
 def claims(result: ReplayResult) -> Iterator[Claim]:
-    """Yield under which conditions the adversarial scene holds."""
     for row in result.table:
         name = f"the adversarial scene of {PurePath(result.answer).name}, {row.way}"
         name += "" if row.way == row.condition else f": {row.condition}"
@@ -139,7 +136,6 @@ def claims(result: ReplayResult) -> Iterator[Claim]:
 
 
 def replay_text(result: ReplayResult) -> str:
-    """Return what the table says, in a sentence."""
     changed = [row for row in result.table[1:] if row.ending != NOT_DONE]
     if not result.table:
         return "Nothing was rendered again."
@@ -153,11 +149,3 @@ def replay_text(result: ReplayResult) -> str:
         names = ", ".join(f"{row.way}: {row.condition}" for row in worthless)
         text += f" The clean scene itself fails under {names}, where it says nothing."
     return text
-
-
-def _rates(row: ReplayRow) -> list[str]:
-    clean, rated = row.clean, row.verified
-    if clean is None or rated is None:
-        return ["", "", "", "", f"{NOT_DONE}: {row.reason}"]
-    verdict = {"found": "holds", "already wrong": "clean is wrong too"}.get(row.ending, "does not hold")
-    return [*wording.rated_cells(clean), *wording.rated_cells(rated), verdict]

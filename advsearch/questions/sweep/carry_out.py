@@ -14,30 +14,11 @@ from advsearch.api.keywords import asks
 from advsearch.cluster import Call
 from advsearch.controls import Control
 from advsearch.controls.camera import CameraControl, measured_in
+from advsearch.engine import judging, loading, naming
 from advsearch.engine.journal import check_made_of, worker_call
-from advsearch.engine.judging import (
-    Metric,
-    check_shared,
-    load_metrics,
-    metrics_as_settings,
-    one_label_for_several,
-    shown,
-)
-from advsearch.engine.judging import only_here as metrics_only_here
-from advsearch.engine.loading import Controls, Scene, load_scene, only_here, scene_as_settings, settings_of
-from advsearch.engine.naming import (
-    AnyModel,
-    check_not_of_scene,
-    check_not_spread,
-    check_run_settings,
-    different,
-    exists_here,
-    given_to,
-    load_models,
-    model_name,
-    scene_of,
-    several,
-)
+from advsearch.engine.judging import Metric, load_metrics
+from advsearch.engine.loading import Controls, Scene, load_scene
+from advsearch.engine.naming import AnyModel, given_to, load_models, model_name
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.options import as_setting
@@ -66,10 +47,8 @@ from advsearch.tasks.together import each_thing
 OUTER = ("object", "environment")
 OF_A_SCENE = ("object", "environment", "up", "size", "unit", "camera", "things", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
-
 WORKER = "advsearch.questions.sweep.carry_out:sweep_worker"  # what a worker does
 CLEAN = "clean"  # what the scene without the adversarial configuration of a run is called beside that with it
-
 AnyScene = Scene | str | Path
 
 
@@ -133,47 +112,46 @@ def sweep(
     controls = controls or brought.get("controls", ())
     task = brought.get("task", task) if task == "classification" else task
     task = make_task(task) if callable(task) else task
-    names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]
-    if names and len(names) < len(scenes):
-        raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
-    described: dict[str, object] = {
-        "model": ",".join(model_name(one) for one in networks),
-        "task": as_setting(task) if isinstance(task, Task) else task,
-        "controls": settings_of(controls),
-        "grid": dict(grid or {}),
-        "samples": samples,
-        "adversarial_of": adversarial_of,
-        "metrics": metrics_as_settings(metrics or {}),
-    }
     loaded = tuple(
         NamedScene(scene.description.object_name, scene.description.environment_name, scene)
         for scene in scenes
         if isinstance(scene, Scene)
     )
+    if 0 < len(loaded) < len(scenes):
+        raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
+    described: dict[str, object] = {
+        "model": ",".join(model_name(one) for one in networks),
+        "task": as_setting(task) if isinstance(task, Task) else task,
+        "controls": loading.settings_of(controls),
+        "grid": dict(grid or {}),
+        "samples": samples,
+        "adversarial_of": adversarial_of,
+        "metrics": judging.metrics_as_settings(metrics or {}),
+    }
     if loaded:
-        check_not_of_scene(options)
-        described |= scene_as_settings(loaded[0].scene)
+        naming.check_not_of_scene(options)
+        described |= loading.scene_as_settings(loaded[0].scene)
         described |= {what: ",".join(dict.fromkeys(getattr(place, what) for place in loaded)) for what in OUTER}
         described |= {"size": None, "set": {}} if len(loaded) > 1 else {}
     else:
-        described["object"] = ",".join(name for some in names for name in some)
+        names = (",".join(split_names(one)) if isinstance(one, str) else str(one) for one in scenes)
+        described["object"] = ",".join(names)
     config = SweepConfig(**{**brought, **described, **options, "run": None if run is None else str(run)})
-    parts = [f"the model {model_name(one)}" for one in networks if exists_here(one)]
+    parts = [f"the model {model_name(one)}" for one in networks if naming.exists_here(one)]
     parts += ["the scene"] if any(place.scene.only_here for place in loaded) else []
     parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
-    parts += [f"the metric {name}" for name in metrics_only_here(config.metrics)]
+    parts += [f"the metric {name}" for name in judging.only_here(config.metrics)]
     parts += ["the tracker"] if tracker is not None else []
-    config = config.with_only_here([*parts, *(f"the control {name}" for name in only_here(controls))])
+    config = config.with_only_here([*parts, *(f"the control {name}" for name in loading.only_here(controls))])
     if config.workers is not None or config.cluster is not None:
-        check_shared(config.metrics)
-    kept = {"keep_pictures": "them", "aov": "the layers", "surface": "the map"}
-    for name, what in kept.items():
+        judging.check_shared(config.metrics)
+    for name, what in {"keep_pictures": "them", "aov": "the layers", "surface": "the map"}.items():
         if config.run is None and getattr(config, name) not in ("none", None, False):
             raise InputError(f"{name}: expected `run` beside it, the folder that keeps {what}; name one")
     progress = watcher(progress)
     named = all(isinstance(network, (str, Path)) for network in networks) and not isinstance(task, OwnTask)
-    if loaded or only_here(controls) or not named:
-        check_not_spread(options)
+    if loaded or loading.only_here(controls) or not named:
+        naming.check_not_spread(options)
     resumed = None  # or the folder of a sweep of the same settings that was stopped
     if config.run is not None:
         path, recipe = run_path(config.run), run_path(config.run) / CONFIG
@@ -184,7 +162,7 @@ def sweep(
             check_free(config.run, overwrite=config.overwrite)
     asked = task if isinstance(task, Task) else config.task
     with begun(config) if config.run is not None and resumed is None else nullcontext(resumed) as begun_in:
-        job = _job(config, loaded or _places(config), several(networks), asked, controls)
+        job = _job(config, loaded or _places(config), naming.several(networks), asked, controls)
         job = replace(job, metrics=load_metrics(config.metrics, metrics), tracker=tracker or job.tracker)
         if config.run is not None:
             return _kept(config, job, progress, begun_in)
@@ -201,9 +179,6 @@ def sweep_from_config(
     progress = progress or NullProgress()
     progress.stage(LOADING)
     return _kept(config, job_of(config), progress, resumed)
-
-
-# ---- from names to things -------------------------------------------------------------------------------------------
 
 
 def _beside_adversarial(
@@ -238,7 +213,6 @@ def _several(given: Any) -> list[Any]:
 
 
 def job_of(config: SweepConfig) -> Job:
-    """Find and load everything that a configuration names."""
     job = _job(config, _places(config), config.models, config.task, config.controls)
     return replace(job, metrics=load_metrics(config.metrics))
 
@@ -254,7 +228,7 @@ def _job(
     config: SweepConfig, places: Sequence[NamedScene], models: Sequence[AnyModel], task: AnyTask, controls: Controls
 ) -> Job:
     travels = ("path", "shutter", "rolling") if config.path is not None else ()  # where no control does, one is added
-    check_run_settings(config.model_copy(update=dict.fromkeys(travels)))
+    naming.check_run_settings(config.model_copy(update=dict.fromkeys(travels)))
     drawn, grid = given_to(config, controls), config.grid
     if config.path is not None:
         drawn, grid = with_frames(config, drawn)
@@ -281,11 +255,11 @@ def _job(
     networks, warnings = load_models(models, made, config)
     _check_different([model.name for model in networks])  # what a file or a function gives may have another's name
     scenes = [place.scene for place in places]
-    tasks = tuple(shown(made.on(network), network, scenes, config) for network in networks)
+    tasks = tuple(judging.shown(made.on(network), network, scenes, config) for network in networks)
     warnings += [remark for task in tasks for remark in task.remarks]
     tasks = tuple(map(each_thing, tasks)) if config.judge == ALL else tasks
     own = {place.object: place.scene.description.object.label for place in places}
-    warnings += one_label_for_several(networks, config.label, own)
+    warnings += judging.one_label_for_several(networks, config.label, own)
     for place in places:
         described = place.scene.description
         for control in on_grid(drawn, axes, described):
@@ -298,10 +272,10 @@ def _job(
 
 
 def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
-    """Every object under every environment; each is loaded once."""
-    objects, environments = different(config.objects, "object"), different(config.environments, "environment")
+    objects = naming.different(config.objects, "object")
+    environments = naming.different(config.environments, "environment")
     asked = environments[0] if config.environment else None
-    scenes = {name: scene_of(config, name, asked) for name in objects}
+    scenes = {name: naming.scene_of(config, name, asked) for name in objects}
     if asked is None:
         return tuple(NamedScene(name, scene.description.environment_name, scene) for name, scene in scenes.items())
     lights = {asked: scenes[objects[0]].description.environment}

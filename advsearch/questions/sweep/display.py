@@ -8,7 +8,7 @@ half. Its interval is exact: each of m shares is judged by the binomial test of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -29,16 +29,22 @@ from advsearch.questions.sweep.summary import (
 )
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, GREY
-from advsearch.report.shown import Claim, Column, Extent, ResultPart, ShownResult, claim, extent_of, share_text
+from advsearch.report.shown import Claim, Column, Extent, ResultPart, ShownResult, claim, counted, extent_of, share_text
 from advsearch.report.wording import beside_text, count, margin_text, percent, prediction_text, short_name
 from advsearch.runs.results import INTERRUPTED
 from advsearch.settings import split_names
 
 READING = "How often it is right at each value, over all others, with the 95 % interval:"
-
 BAR = 20  # width of a bar in characters
 MOST_ROWS = 24  # values of an axis that are all shown; of more, half as many: those where the model does worst
 MOST_LISTED = 96  # values of an axis that a page lists as a table; of more, none
+
+
+def _difference(part: SurfacePart) -> str:
+    low, high = part.interval
+    interval = f" ({low:+.0%} to {high:+.0%})" if low == low else ""  # none where pictures share draws
+    return f"{part.difference:+.0%}{interval}".replace("%", " %")
+
 
 AXIS_COLUMNS: dict[str, Column] = {
     "value": lambda row: wording.value_text(row.value) + (f" {row.unit}" if row.unit not in ("", "name") else ""),
@@ -61,20 +67,17 @@ SURFACE_COLUMNS: dict[str, Column] = {
     "face": "{0.face}",
     "wrong where seen": lambda one: wrong_text(one.seen),
     "wrong where not": lambda one: wrong_text(one.hidden),
-    "difference": lambda one: difference_text(one),
+    "difference": _difference,
     "p": "{0.p:.2g}",
 }
 
 
 def shown(summary: SweepSummary) -> ShownResult:
-    """Return accuracy in total and by axis, the worst configuration and the cost."""
     sections = list[ResultPart]()
     if summary.beside is not None and summary.ending != INTERRUPTED:
         for pair in summary.beside.pairs:
-            rows = []
-            for name, counts in (("clean", pair.clean), (summary.beside.answer, pair.answer)):
-                share = percent(counts.accuracy), wording.interval_text(counts.interval)
-                rows.append([name, f"right in {counts.correct} of {counts.configurations}", *share])
+            named = (("clean", pair.clean), (summary.beside.answer, pair.answer))
+            rows = [[name, f"right in {one.correct} of {one.configurations}", *_share(one)] for name, one in named]
             sections.append(ResultPart(rows=rows))
     if far := distance_of(summary):
         sections.append(ResultPart(text=[distance_sentence(far)]))
@@ -82,16 +85,19 @@ def shown(summary: SweepSummary) -> ShownResult:
         ResultPart(drive_title(rates), heads=DRIVE_HEADS, rows=drive_rows(rates)) for rates in summary.drives or ()
     ]
     sections.append(ResultPart.table(summary.changes or [], CHANGE_COLUMNS, title=CHANGED))
-    if rows_by_axis := {name: rows for name, rows in _by_axis(summary).items() if name != "answer"}:
+    axes: dict[str, list[AxisRow]] = {}
+    for row in summary.axes:
+        axes.setdefault(row.axis, []).append(row)
+    if axes.keys() - {"answer"}:
         both = f"Of the clean scene and the adversarial one together: {READING[0].lower()}{READING[1:]}"
         sections.append(ResultPart(text=[both if summary.beside else READING]))
-        sections += [_table(name, rows) for name, rows in rows_by_axis.items()]
+        sections += [_table(name, rows) for name, rows in axes.items() if name != "answer"]
     if summary.surface is not None:
         said = "\n".join(surface_sentences(summary.surface))
         sections.append(ResultPart("What is seen of the surface when the model is wrong:", [said]))
     if (size := figure_size(summary)) is not None:
         sections.append(ResultPart(draw=lambda axes: sweep_axes(summary, axes), size=size, only="notebook"))
-    sections += (replace(part, only="page") for part in _page_parts(summary))
+    sections += (replace(part, only="page") for part in _page_parts(summary, axes))
     configuration = there = ""
     if (worst := summary.worst) is not None:
         outer = [name for name in ("object", "environment", "model") if name in worst.values]
@@ -111,7 +117,7 @@ def shown(summary: SweepSummary) -> ShownResult:
     return ShownResult(_verdict(summary), sections, facts)
 
 
-def _page_parts(summary: SweepSummary) -> Iterator[ResultPart]:
+def _page_parts(summary: SweepSummary, axes: Mapping[str, Sequence[AxisRow]]) -> Iterator[ResultPart]:
     """What a page shows beside its explorer: from how far away, whole drives, the surface, and each axis in numbers."""
     if far := distance_of(summary):
         said = distance_sentence(far)
@@ -127,7 +133,7 @@ def _page_parts(summary: SweepSummary) -> Iterator[ResultPart]:
             who = f"{short_name(table.object)}, {short_name(table.model)}"
             title = f"{who}: the {table.part}s that are told most clearly"
             yield ResultPart.table(table.strongest, SURFACE_COLUMNS, title=title, folded=True)
-    for name, rows in _by_axis(summary).items():
+    for name, rows in axes.items():
         if len(rows) <= MOST_LISTED:
             yield ResultPart.table(rows, AXIS_COLUMNS, title=f"Accuracy by {name}", folded=True)
 
@@ -140,9 +146,8 @@ def _verdict(summary: SweepSummary) -> str:
         return "Interrupted before the first configuration."
     rate = rate_text(summary)
     if summary.ending == INTERRUPTED and summary.looked_at < summary.planned:
-        return (
-            f"Interrupted after {summary.looked_at} of {summary.planned} configurations: right in {correct} ({rate})."
-        )
+        looked_at = f"{summary.looked_at} of {summary.planned} configurations"
+        return f"Interrupted after {looked_at}: right in {correct} ({rate})."
     if summary.beside and summary.beside.pairs:
         return " ".join(beside_text(summary.beside.answer, pair) for pair in summary.beside.pairs)
     return f"The model is right in {correct} of {count(seen, 'configuration')} ({rate}){of_grid(summary)}."
@@ -153,9 +158,8 @@ def of_grid(summary: SweepSummary) -> str:
     return "" if summary.sampler is not None or not summary.grid else " of this grid; another has another share"
 
 
-def _by_axis(summary: SweepSummary) -> dict[str, list[AxisRow]]:
-    names = dict.fromkeys(row.axis for row in summary.axes)
-    return {name: [row for row in summary.axes if row.axis == name] for name in names}
+def _share(counts: CountedPredictions) -> tuple[str, str]:
+    return percent(counts.accuracy), wording.interval_text(counts.interval)
 
 
 def _table(name: str, rows: Sequence[AxisRow]) -> ResultPart:
@@ -164,16 +168,11 @@ def _table(name: str, rows: Sequence[AxisRow]) -> ResultPart:
         worst = sorted(range(len(rows)), key=lambda number: rows[number].accuracy or 0.0)[: MOST_ROWS // 2]
         listed = [rows[number] for number in sorted(worst)]
         title += f" (the {len(listed)} of {len(rows)} values where the model is right least often)"
-    lines = [
-        [
-            wording.value_text(row.value),
-            "#" * (filled := round((row.accuracy or 0.0) * BAR)) + "." * (BAR - filled),
-            percent(row.accuracy),
-            f"{row.correct} of {row.configurations}",
-            wording.interval_text(row.interval),
-        ]
-        for row in listed
-    ]
+    lines = []
+    for row in listed:
+        bar = ("#" * round((row.accuracy or 0.0) * BAR)).ljust(BAR, ".")
+        share, interval = _share(row)
+        lines.append([wording.value_text(row.value), bar, share, f"{row.correct} of {row.configurations}", interval])
     return ResultPart(title, rows=lines)
 
 
@@ -181,7 +180,6 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
     """Yield the share of right predictions, and how often the worst of the configurations is wrong."""
     if result.accuracy is None or result.interval is None or result.ending != "finished":
         return
-    extent = _extent("configurations in which the model is right", result)
     thing = f"frames of {result.drives[0].drives} drives" if result.drives else "configurations"
     how, note = f"{thing} drawn by chance from the ranges that are named", ""
     if result.sampler is None and not result.grid:
@@ -208,15 +206,16 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
             yield claim("measured", beside_text(result.beside.answer, pair), None)
     if result.beside and result.beside.pairs:
         return
-    models = [row for row in result.axes if row.axis == "model"]
-    if len(split_names(result.model)) < 2 or not models:
-        how += _in_each(result)
-        yield claim("measured", f"The model is right in {share_text(extent)} {how}.{note}", extent)
-    for row in models:  # they are shown the same pictures, so that predictions of several are not independent
-        own = _extent(extent.what, row)
-        yield claim(
-            "measured", f"The model {row.value} is right in {share_text(own)} {how}{_in_each(result)}.{note}", own
-        )
+    several = {name: sum(row.axis == name for row in result.axes) for name in ("object", "environment")}
+    each = [f"each of the {count} {name}s" for name, count in several.items() if count > 1]  # which are not drawn
+    how += f", as many in {' and '.join(each)}" if each else ""
+    # models are shown the same pictures, so that predictions of several are not independent
+    models: dict[str, CountedPredictions] = {
+        f"The model {row.value}": row for row in result.axes if row.axis == "model"
+    }
+    for who, counts in (models if len(split_names(result.model)) > 1 and models else {"The model": result}).items():
+        extent = _extent("configurations in which the model is right", counts)
+        yield claim("measured", f"{who} is right in {share_text(extent)} {how}.{note}", extent)
     if far := distance_of(result):
         yield claim("measured", distance_sentence(far), None)
     for drive in result.drives or ():
@@ -233,18 +232,7 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
 
 
 def _extent(what: str, counts: CountedPredictions) -> Extent:
-    interval = counts.interval or (0.0, 1.0)
-    return Extent(what=what, count=counts.correct, total=counts.configurations, interval=interval)
-
-
-def _in_each(result: SweepSummary) -> str:
-    """That there are as many in each of several objects and environments, which are not drawn."""
-    several = {name: sum(row.axis == name for row in result.axes) for name in ("object", "environment")}
-    each = [f"each of the {count} {name}s" for name, count in several.items() if count > 1]
-    return f", as many in {' and '.join(each)}" if each else ""
-
-
-# ---- over drives, on the surface, and from how far away --------------------------------------------------------------
+    return counted(what, counts.correct, counts.configurations, counts.interval)
 
 
 DRIVE_HEADS = ("", "mean", "95 % interval", "worst drive")  # what stands above the rows
@@ -257,39 +245,33 @@ def rate_text(summary: SweepSummary) -> str:
 
 
 def drive_title(one: DriveRates) -> str:
-    """Return what drives they are, and of which model."""
     what = f"{count(one.drives, 'drive')} of {one.frames} frames in {one.seconds:g} s, {one.model}"
     return what if one.answer is None else f"{what}, with {one.answer}"
 
 
 def drive_rows(one: DriveRates) -> list[tuple[str, str, str, str]]:
-    """Return a row for each number, as `DRIVE_HEADS` says."""
-    rows = [
-        ("frames in which it is right", *_texts(one.right, 100.0, " %")),
-        ("longest gap", *_texts(one.longest_gap, 1.0, " s")),
-        ("changes a second", *_texts(one.flicker, 1.0, "")),
+    tracks, never = one.tracks, f", never in {one.never_seen}" if one.never_seen else ""
+    told: list[tuple[str, OverDrives | None, str, str]] = [
+        ("frames in which it is right", one.right, " %", ""),
+        ("first right at a distance of", one.first_seen, f" {one.unit}", never),
+        ("longest gap", one.longest_gap, " s", ""),
+        ("changes a second", one.flicker, "", ""),
+        ("frames without its track", tracks.lost if tracks else None, " %", ""),
+        ("identity switches", tracks.switches if tracks else None, "", ""),
+        ("longest gap of its track", tracks.longest_gap if tracks else None, " s", ""),
     ]
-    if one.tracks is not None:
-        rows += [
-            ("frames without its track", *_texts(one.tracks.lost, 100.0, " %")),
-            ("identity switches", *_texts(one.tracks.switches, 1.0, "")),
-            ("longest gap of its track", *_texts(one.tracks.longest_gap, 1.0, " s")),
-        ]
-    if one.first_seen is not None:
-        never = f", never in {one.never_seen}" if one.never_seen else ""
-        mean, interval, worst = _texts(one.first_seen, 1.0, f" {one.unit}")
-        rows.insert(1, ("first right at a distance of", mean + never, interval, worst))
+    rows = []
+    for name, number, unit, more in told:
+        if number is not None:
+            factor, (low, high) = 100.0 if unit == " %" else 1.0, number.interval or (0.0, 0.0)
+            interval = f"{low * factor:.3g} to {high * factor:.3g}{unit}" if number.interval else "-"
+            rows.append(
+                (name, f"{number.mean * factor:.3g}{unit}{more}", interval, f"{number.worst * factor:.3g}{unit}")
+            )
     return rows
 
 
-def _texts(number: OverDrives, factor: float, unit: str) -> tuple[str, str, str]:
-    low, high = number.interval or (0.0, 0.0)
-    interval = f"{low * factor:.3g} to {high * factor:.3g}{unit}" if number.interval else "-"
-    return f"{number.mean * factor:.3g}{unit}", interval, f"{number.worst * factor:.3g}{unit}"
-
-
 def surface_sentences(surface: SurfaceMap) -> list[str]:
-    """Return what the map of each object and model says, a sentence or two each."""
     sentences = []
     for table in (table for table in surface.tables if table.part == "cell"):
         cells, least = count(table.compared, table.part), surface.least
@@ -308,15 +290,7 @@ def surface_sentences(surface: SurfaceMap) -> list[str]:
 
 
 def wrong_text(counted: CountedPredictions) -> str:
-    """Return ``35 of 40``: wrong predictions among all."""
     return f"{counted.configurations - counted.correct} of {counted.configurations}"
-
-
-def difference_text(part: SurfacePart) -> str:
-    """Return ``+83 % (+66 % to +91 %)``."""
-    low, high = part.interval
-    interval = f" ({low:+.0%} to {high:+.0%})" if low == low else ""  # none where pictures share draws
-    return f"{part.difference:+.0%}{interval}".replace("%", " %")
 
 
 DISTANCE = "camera.distance"  # the axis
@@ -352,42 +326,49 @@ def distance_of(summary: SweepSummary) -> SeenFrom | None:
 def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
     """Return the distance at which an object is first seen, from the rows of one axis: a distance, or both ends of a
     range of it, and the counts there. Raises InputError where there are fewer than two distances."""
+    from scipy.optimize import isotonic_regression  # takes a quarter of a second
+    from scipy.special import bdtr, bdtrc
+
     if len(rows) < 2:
         raise InputError(f"detection distance: expected at least two distances, got {len(rows)}; sweep over more")
-    rows = sorted(rows, key=_middle)
-    distances = tuple(map(_middle, rows))
-    counted = [(at, row.correct, row.configurations) for at, row in zip(distances, rows, strict=True)]
-    chance = 0.025 / len(counted)
+    middles = [math.sqrt(math.prod(row.value)) if isinstance(row.value, tuple) else float(row.value) for row in rows]
+    distances, rows = zip(*sorted(zip(middles, rows, strict=True), key=lambda pair: pair[0]), strict=True)
+    at, k, n = (np.array(column) for column in (distances, [r.correct for r in rows], [r.configurations for r in rows]))
+    chance = 0.025 / len(rows)
+    low = max(at[bdtrc(k - 1.0, n, HALF) < chance], default=None)
+    high = min(at[(bdtr(k * 1.0, n, HALF) < chance) & (at > (low or 0.0))], default=None)
+    falling = isotonic_regression(k / n, weights=n, increasing=False).x
+    distance = np.exp(np.interp(-HALF, -falling, np.log(at))) if falling[0] >= HALF > falling[-1] else None
     least = math.floor(-math.log2(chance)) + 1
-    low = max((at for at, k, n in counted if _at_least(k, n) < chance), default=None)
-    below = [at for at, k, n in counted if _at_least(n - k, n) < chance and at > (low or 0.0)]
+    low, high, distance = (None if end is None else float(end) for end in (low, high, distance))
     return SeenFrom(
         unit=rows[0].unit,
         distances=distances,
-        shares=tuple(k / n for _, k, n in counted),
+        shares=tuple((k / n).tolist()),
         intervals=tuple(row.interval or (0.0, 1.0) for row in rows),
-        distance=_crossing(distances, _falling([k / n for _, k, n in counted], [n for *_, n in counted])),
+        distance=distance,
         low=low,
-        high=min(below, default=None),
-        lacking=None if any(n >= least for _, _, n in counted) else least,
+        high=high,
+        lacking=None if (n >= least).any() else least,
     )
 
 
 def distance_sentence(found: SeenFrom) -> str:
     """Say it: "Seen from 38 m, 31 to 44 m ..."."""
     unit = "m" if found.unit == "metres" else found.unit
-    ends = f"{_text(found.low)} to {_text(found.high)}" if found.low is not None and found.high is not None else None
-    if ends is None:
-        ends = "no bound" if found.low is found.high else f"at least {_text(found.low)}"
-        ends = f"at most {_text(found.high)}" if found.low is None and found.high is not None else ends
-    what = f"{ends}{'' if ends == 'no bound' else f' {unit}'} with 95 % confidence"
+    low, high, distance = (
+        None if number is None else f"{number:.3g}" for number in (found.low, found.high, found.distance)
+    )
+    ends = f"{low} to {high} {unit}" if low and high else f"at least {low} {unit}" if low else "no bound"
+    ends = f"at most {high} {unit}" if high and not low else ends
+    what = f"{ends} with 95 % confidence"
     what += "" if found.lacking is None else f" (that takes at least {found.lacking} pictures at each distance)"
-    if found.distance is not None:
-        return f"Seen from {_text(found.distance)} {unit} in half of the pictures, {what}."
+    if distance is not None:
+        return f"Seen from {distance} {unit} in half of the pictures, {what}."
     if found.shares[0] >= HALF:
-        farthest = f"{_text(found.distances[-1])} {unit}"
+        farthest = f"{found.distances[-1]:.3g} {unit}"
         return f"Seen in at least half of the pictures up to the farthest distance, {farthest}; {what}."
-    return f"Not seen in half of the pictures, even from {_text(found.distances[0])} {unit}; {what}."
+    return f"Not seen in half of the pictures, even from {found.distances[0]:.3g} {unit}; {what}."
 
 
 def distance_axes(found: SeenFrom, axes: Any) -> None:
@@ -402,33 +383,3 @@ def distance_axes(found: SeenFrom, axes: Any) -> None:
     axes.set_title("How far away it is seen")
     axes.grid(True)
     axes.legend()
-
-
-def _at_least(successes: int, trials: int) -> float:
-    """The chance of so many successes or more, where each trial is one with a chance of a half."""
-    ways: int = sum(math.comb(trials, k) for k in range(successes, trials + 1))
-    return ways / (1 << trials)
-
-
-def _middle(row: AxisRow) -> float:
-    value = row.value
-    return math.sqrt(value[0] * value[1]) if isinstance(value, tuple) else float(value)
-
-
-def _falling(shares: Sequence[float], trials: Sequence[int]) -> list[float]:
-    """The shares (m,) of successes in trials, made to fall or stay from each to the next by pooling."""
-    from scipy.optimize import isotonic_regression  # takes a quarter of a second
-
-    pooled: list[float] = isotonic_regression(shares, weights=trials, increasing=False).x.tolist()
-    return pooled
-
-
-def _crossing(distances: Sequence[float], shares: Sequence[float]) -> float | None:
-    """Where a falling line through the shares passes one half; None where it does not."""
-    if not shares[0] >= HALF > shares[-1]:
-        return None
-    return float(np.exp(np.interp(-HALF, np.negative(shares), np.log(distances))))
-
-
-def _text(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"

@@ -5,7 +5,6 @@ has ends that it cannot pass (`attacks.units`)."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,9 +27,7 @@ from advsearch.tasks import Detection
 
 ANIMATED = 60
 MOST_LISTED = 1000  # drives of a model whose own numbers are kept
-
 UNKNOWN, HIDDEN = -1, 2
-
 Flags = npt.NDArray[np.int8]
 
 
@@ -68,26 +65,32 @@ class Drives:
         away = np.full(shape[:-1], np.nan)
         self._ways: dict[int, str] = {}
         self._frames: dict[int, DetectedFrame] = {}
-        names = [[job.right_names(place, model) for model in range(len(job.models))] for place in job.places]
-        rows_of_a_place = right.size // len(job.places)
-        which = f"{axis.instance}.{WAY}"
-        name, self._unit = f"{axis.instance}.distance", "object sizes"
+        right_names = {
+            (number, model): task.names(task.right_classes(job.facts(place, {})))
+            for number, place in enumerate(job.places)
+            for model, task in enumerate(job.tasks)
+            if isinstance(task, Detection)
+        }
+        which, distance = f"{axis.instance}.{WAY}", f"{axis.instance}.distance"
+        self._unit = "object sizes"
         for row in rows:
+            picture, model = divmod(row.step, len(job.models))
             right.flat[row.step] = HIDDEN if row.label == OUT_OF_VIEW else bool(row.correct)
-            if (distance := row.values.get(name)) is not None:
-                away.flat[row.step // len(job.models)] = float(str(distance["value"]))
-                self._unit = distance["unit"]
-            if isinstance(job.tasks[row.step % len(job.models)], Detection) and isinstance(row.payload, dict):
-                right_names = names[row.step // rows_of_a_place][row.step % len(job.models)]
-                self._frames[row.step] = frame_of(row.payload, right_names)
+            if distance in row.values:
+                away.flat[picture] = float(str(row.values[distance]["value"]))
+                self._unit = row.values[distance]["unit"]
+            names = right_names.get((picture // job.per_scene, model))
+            if names is not None and isinstance(row.payload, dict):
+                self._frames[row.step] = frame_of(row.payload, names)
             if which in row.values:
                 self._ways[row.step] = str(row.values[which]["value"])
         times = np.array([float(value) for value in axis.values])
         order = np.argsort(times)
         self.times = times[order]
-        self._numbers = np.moveaxis(np.arange(right.size).reshape(shape), place + 1, -1)[..., order]
-        self._right = np.moveaxis(right, place + 1, -1)[..., order]
-        self._away = np.moveaxis(away, place + 1, -1)[..., order]
+        self.seconds = float(self.times[-1] - self.times[0])
+        self._right, self._numbers, self._away = (
+            np.moveaxis(of, place + 1, -1)[..., order] for of in (right, np.arange(right.size).reshape(shape), away)
+        )
 
     def _whole(self, places: list[int], model: int) -> tuple[Flags, npt.NDArray[np.float64], npt.NDArray[np.int64]]:
         """Of the drives with all their frames (n, frames): whether a model is right, how far away it is, and rows."""
@@ -96,64 +99,64 @@ class Drives:
         return right[whole], self._away[places].reshape(right.shape)[whole], numbers[whole]
 
     def rates(self) -> list[DriveRates]:
-        """Return what is said of the drives of each model, without and with an adversarial scene."""
+        """Return what is said of the drives of each model, without and with an adversarial scene. Frames without the
+        object are neither right nor a gap."""
         rates, places = list[DriveRates](), self._job.places
+        seconds, frames = self.seconds, len(self.times)
+        step = seconds / (frames - 1)
         for beside_clean in dict.fromkeys(place.beside_clean for place in places):
             those = [number for number, place in enumerate(places) if place.beside_clean == beside_clean]
             for model, network in enumerate(self._job.models):
                 flags, away, numbers = self._whole(those, model)
-                if len(flags):
-                    told = self._rates(flags, away, numbers[:, 0].tolist())
-                    tracks = self._tracks(model, numbers)
-                    rates.append(DriveRates(model=network.name, answer=beside_clean or None, tracks=tracks, **told))
-        return rates
-
-    def _rates(self, flags: Flags, away: npt.NDArray[np.float64], begins: list[int]) -> dict[str, Any]:
-        """What is said of drives, by their first rows (n,) too. Frames without the object are neither right nor a
-        gap."""
-        right, wrong, shown = flags == 1, flags == 0, flags != HIDDEN
-        share = right.sum(axis=1) / shown.sum(axis=1)
-        seconds, frames = float(self.times[-1] - self.times[0]), len(self.times)
-        step = seconds / (frames - 1)
-        seen: npt.NDArray[np.bool_] = np.asarray(right.any(axis=1))
-        at_first = away[np.arange(len(right)), right.argmax(axis=1)]
-        first, gaps = at_first[seen], np.array([longest(drive) for drive in wrong]) * step
-        together = shown[:, 1:] & shown[:, :-1]
-        changes = ((right[:, 1:] != right[:, :-1]) & together).sum(axis=1) / seconds
-        ends = float(away.min()), float(away.max())
-        return {
-            "drives": len(right),
-            "frames": frames,
-            "seconds": seconds,
-            "right": over_drives(share, worst=min),
-            "longest_gap": over_drives(gaps, max, (0.0, frames * step)),
-            "first_seen": over_drives(first, min, ends) if len(first) and np.isfinite(ends).all() else None,
-            "unit": self._unit,
-            "never_seen": int((~seen).sum()),
-            "flicker": over_drives(changes, max, (0.0, (frames - 1) / seconds)),
-            "each": [
-                OneDrive(
-                    row=begin,
-                    path=self._ways.get(begin),
-                    right=float(share[k]),
-                    first_seen=float(at_first[k]) if seen[k] and np.isfinite(at_first[k]) else None,
-                    longest_gap=float(gaps[k]),
-                    flicker=float(changes[k]),
+                if not len(flags):
+                    continue
+                right, shown = flags == 1, flags != HIDDEN
+                share = right.sum(axis=1) / shown.sum(axis=1)
+                seen: npt.NDArray[np.bool_] = np.asarray(right.any(axis=1))
+                at_first = away[np.arange(len(right)), right.argmax(axis=1)]
+                first, gaps = at_first[seen], np.array([longest(drive) for drive in flags == 0]) * step
+                together = shown[:, 1:] & shown[:, :-1]
+                changes = ((right[:, 1:] != right[:, :-1]) & together).sum(axis=1) / seconds
+                ends = float(away.min()), float(away.max())
+                known = len(first) > 0 and bool(np.isfinite(ends).all())
+                drives = DriveRates(
+                    model=network.name,
+                    answer=beside_clean or None,
+                    drives=len(right),
+                    frames=frames,
+                    seconds=seconds,
+                    right=over_drives(share, worst=min),
+                    longest_gap=over_drives(gaps, max, (0.0, frames * step)),
+                    first_seen=over_drives(first, min, ends) if known else None,
+                    unit=self._unit,
+                    never_seen=int((~seen).sum()),
+                    flicker=over_drives(changes, max, (0.0, (frames - 1) / seconds)),
+                    tracks=self._tracks(model, numbers),
+                    each=[
+                        OneDrive(
+                            row=begin,
+                            path=self._ways.get(begin),
+                            right=float(share[k]),
+                            first_seen=float(at_first[k]) if seen[k] and np.isfinite(at_first[k]) else None,
+                            longest_gap=float(gaps[k]),
+                            flicker=float(changes[k]),
+                        )
+                        for k, begin in enumerate(numbers[:MOST_LISTED, 0].tolist())
+                    ],
                 )
-                for k, begin in enumerate(begins[:MOST_LISTED])
-            ],
-        }
+                rates.append(drives)
+        return rates
 
     def _tracks(self, model: int, numbers: npt.NDArray[np.int64]) -> TrackRates | None:
         """What a tracker makes of drives, by the numbers (n, frames) of their rows; None without boxes in all."""
-        task, frames = self._job.tasks[model], len(self.times)
+        task, frames, tracker = self._job.tasks[model], len(self.times), self._job.tracker
         if not isinstance(task, Detection) or not all(number in self._frames for number in numbers.flat):
             return None
-        drives = [tracked([self._frames[k] for k in row], self._job.tracker, task.iou) for row in numbers.tolist()]
-        step = float(self.times[-1] - self.times[0]) / (frames - 1)
+        drives = [tracked([self._frames[k] for k in row], tracker, task.iou) for row in numbers.tolist()]
+        step = self.seconds / (frames - 1)
         lost, switches, gaps = (np.array(values, dtype=float) for values in zip(*drives, strict=True))
         return TrackRates(
-            tracker=str(getattr(self._job.tracker, "__name__", type(self._job.tracker).__name__)),
+            tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
             lost=over_drives(lost, max),
             switches=over_drives(switches, max, (0.0, frames - 1.0)),
             longest_gap=over_drives(gaps * step, max, (0.0, frames * step)),
@@ -165,19 +168,16 @@ class Drives:
         if len(flags):
             share = (flags == 1).sum(axis=1) / (flags != HIDDEN).sum(axis=1)
             worst = numbers[share.argmin()] // len(self._job.models)
-            pictures = [picture_of(scenes, int(number)) for number in worst[evenly(len(worst), ANIMATED)]]
-            write_drive(run, "drive", pictures, float(self.times[-1] - self.times[0]))
-
-
-def picture_of(scenes: OpenScenes, number: int) -> npt.NDArray[np.float32]:
-    """Return the picture (h, w, 3) with a number, with the marks of the first model's prediction."""
-    view, (query, *_) = scenes.asked(number)
-    picture = view.pictures([query])[0]
-    return np.asarray(marked(picture.numpy(), view.problems[0].marks(picture, query.u)), dtype=np.float32)
+            pictures = []
+            for number in worst[evenly(len(worst), ANIMATED)].tolist():
+                view, (query, *_) = scenes.asked(number)
+                picture = view.picture(query)
+                drawn = marked(picture.numpy(), view.problems[0].marks(picture, query.u))
+                pictures.append(np.asarray(drawn, dtype=np.float32))
+            write_drive(run, "drive", pictures, self.seconds)
 
 
 def longest(flags: npt.NDArray[np.bool_]) -> int:
-    """Return the length of the longest run of true values."""
     ends = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return int((ends[1::2] - ends[::2]).max(initial=0))
 

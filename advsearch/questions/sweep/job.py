@@ -16,7 +16,7 @@ from advsearch.attacks.domain import Seeds
 from advsearch.controls import Control, Space, make_control, make_space
 from advsearch.described import Value
 from advsearch.engine.journal import Journal, Sent, Shared
-from advsearch.engine.judging import Looked, Metrics, check_truth, domain_of, facts_of
+from advsearch.engine.judging import Metrics, check_truth, domain_of, facts_of
 from advsearch.engine.loading import Scene, framed, make_renderer
 from advsearch.engine.problem import AWAY, Prepared, Problem, as_claimed, changed
 from advsearch.engine.record import Stages, rate_of
@@ -32,8 +32,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.scene.description import ENVIRONMENT, OBJECT
 from advsearch.scene.formation import next_count, to_8_bit
 from advsearch.scene.renderer import Renderer
-from advsearch.tasks import Detection, Facts, Judgement, Task
-from advsearch.tasks.base import Truth
+from advsearch.tasks import Facts, Judgement, Task
 from advsearch.viewer import thumbnails
 
 KIND = "sweep"  # rows of the sweep, and the stream of their seeds
@@ -54,12 +53,9 @@ class NamedScene:
     beside_clean: str = ""
 
     @property
-    def values(self) -> dict[str, Value]:
-        named: dict[str, Value] = {
-            "object": {"value": self.object, "unit": ""},
-            "environment": {"value": self.environment, "unit": ""},
-        }
-        return {**named, "answer": {"value": self.beside_clean, "unit": ""}} if self.beside_clean else named
+    def names(self) -> dict[str, str]:
+        named = {"object": self.object, "environment": self.environment}
+        return {**named, "answer": self.beside_clean} if self.beside_clean else named
 
 
 @dataclass(frozen=True)
@@ -98,8 +94,6 @@ class Job:
         """Of each model, whether no model before it is shown the same pictures."""
         return tuple(size not in self.sizes[:model] for model, size in enumerate(self.sizes))
 
-    # ---- what is asked ----------------------------------------------------------------------------------------------
-
     @cached_property
     def per_scene(self) -> int:
         """Pictures of a scene."""
@@ -107,7 +101,6 @@ class Job:
 
     @cached_property
     def seeds(self) -> Seeds:
-        """Of the noise of draws."""
         return Seeds(self.config.seed, KIND)
 
     def bound(self, scene: int) -> dict[tuple[int, int], Points]:
@@ -121,28 +114,27 @@ class Job:
     def queries(self, numbers: range) -> list[Sent]:
         """Ask all models about the pictures with these numbers, all of one scene, whose number is the name."""
         scene = numbers.start // self.per_scene
-        before, models, sent = scene * self.per_scene, len(self.models), list[Sent]()
-        place, keep = self.places[scene], self.config.keep_pictures != "none"
+        place, before, keep = self.places[scene], scene * self.per_scene, self.config.keep_pictures != "none"
         held = {control.name for control in place.held}
-        picked: dict[tuple[int, int], tuple[Tensor, list[dict[str, Value]]]] = {}
+        queries: dict[int, Query] = {}
         for size, points in self.bound(scene).items():
-            picks = points.picks(numbers.start - before, len(numbers), before)
-            u = points.configurations(picks)
-            picked[size] = u, points.values(u, picks)
-        for k, number in enumerate(numbers):
-            for model, size in enumerate(self.sizes):
-                points, (u, values) = self.bound(scene)[size], picked[size]
-                said, lit_by = place.values, points.space.lit_by(values[k])
+            u = points.configurations(numbers.start - before, len(numbers), before)
+            described = points.values(u, numbers.start - before)
+            for number, configuration, values in zip(numbers, u, described, strict=True):
+                names, lit_by = place.names, points.space.lit_by(values)
                 if lit_by is not None:
-                    said["environment"] = {"value": lit_by, "unit": ""}
-                said["model"] = {"value": self.models[model].name, "unit": ""}
-                said |= {name: value for name, value in values[k].items() if name.partition(".")[0] not in held}
-                seed, step = self.seeds(points.noise(number)), number * models + model
-                query = Query(
-                    u[k].clone(), seed, KIND, step, spp=self.spp, drawn=False, values=said, sought=False, keep=keep
-                )
-                sent.append((str(scene), None, query))
-        return sent
+                    names["environment"] = lit_by
+                seed = self.seeds(points.noise(number))
+                for model in (model for model, own in enumerate(self.sizes) if own == size):
+                    names["model"] = self.models[model].name
+                    told: dict[str, Value] = {name: {"value": text, "unit": ""} for name, text in names.items()}
+                    told |= {name: value for name, value in values.items() if name.partition(".")[0] not in held}
+                    step = number * len(self.models) + model
+                    queries[step] = Query(
+                        configuration.clone(), seed, KIND, step, spp=self.spp, drawn=False, values=told, sought=False,
+                        keep=keep,
+                    )  # fmt: skip
+        return [(str(scene), None, queries[step]) for step in sorted(queries)]
 
     def space(self, place: NamedScene, size: tuple[int, int]) -> Space:
         """The controls, those of the grid as choices, bound to a scene."""
@@ -151,49 +143,34 @@ class Job:
         if not controls:
             return Space((), None)
         space = make_space(controls, description)
-        if not place.held:
-            return _checked(space, place)
-        start = torch.cat([bound.start for bound in space.controls[: len(place.held)]])
-        if place.u is not None and len(place.u) != len(start):
-            raise InputError(
-                f"adversarial_of: the adversarial configuration of {place.beside_clean} has {len(place.u)} numbers, "
-                f"and {place.object} takes {len(start)}: it is another object, or it has changed since; do the run "
-                "again"
-            )
-        return _checked(space.holding(start if place.u is None else place.u), place)
+        if place.held:
+            start = torch.cat([bound.start for bound in space.controls[: len(place.held)]])
+            if place.u is not None and len(place.u) != len(start):
+                raise InputError(
+                    f"adversarial_of: the adversarial configuration of {place.beside_clean} has {len(place.u)} "
+                    f"numbers, and {place.object} takes {len(start)}: it is another object, or it has changed since; "
+                    "do the run again"
+                )
+            space = space.holding(start if place.u is None else place.u)
+        for group in space.groups:
+            if group.setting in place.scene.description.given - {ENVIRONMENT}:
+                raise InputError(
+                    f"`controls` {group.control}: draws {group.parameter} by chance, and `set` {group.setting} fixes "
+                    "it; leave it out of one of the two"
+                )
+        return space
 
     def points(self, space: Space) -> Points:
         """The configurations of a space; those with an adversarial scene have the draws of those without it."""
         scenes = len(self.places) // 2 if self.places[0].beside_clean else 0
-        domain = domain_of(space.controls)
-        among, config = len(self.places), self.config
-        return Points(space, domain, self.axes, self.samples, config.sampler, config.seed, scenes, among)
+        domain, config = domain_of(space.controls), self.config
+        return Points(space, domain, self.axes, self.samples, config.sampler, config.seed, scenes, len(self.places))
 
-    def truth(self, place: NamedScene, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
-        """What is true of a configuration, by what is described and seen of it, as the task of a model needs it."""
-        return self.tasks[model].truth(self.facts(place, values, look))
-
-    def facts(self, place: NamedScene, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
-        return facts_of(place.scene, place.object, self.config, lambda: values, look)
-
-    def right_names(self, place: NamedScene, model: int) -> tuple[str, ...]:
-        """The names of the classes that are right for a detector; none for models of other tasks."""
-        task = self.tasks[model]
-        return task.names(task.right_classes(self.facts(place, {}))) if isinstance(task, Detection) else ()
-
-
-def _checked(space: Space, place: NamedScene) -> Space:
-    for group in space.groups:
-        if group.setting in place.scene.description.given - {ENVIRONMENT}:
-            raise InputError(
-                f"`controls` {group.control}: draws {group.parameter} by chance, and `set` {group.setting} fixes it; "
-                "leave it out of one of the two"
-            )
-    return space
+    def facts(self, place: NamedScene, values: Mapping[str, Value]) -> Facts:
+        return facts_of(place.scene, place.object, self.config, lambda: values, None)
 
 
 def check_scenes(places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]) -> None:
-    """Refuse to vary what the scenes were asked to have."""
     given = {name for place in places for name in place.scene.description.given}
     drawn, choosing = {control.name: control for control in controls}, list[str]()
     for axis in axes:
@@ -241,9 +218,6 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     return first, tuple(drawn)
 
 
-# ---- scenes, rendered ------------------------------------------------------------------------------------------------
-
-
 class SweptScene:
     """One scene, ready to be rendered and shown to the models: a `Problem` for each of them. Points, renderers and what
     predicts pictures are there for each size of picture, on which what a control frames may depend."""
@@ -289,8 +263,8 @@ class SweptScene:
         for query in queries:
             number, model = divmod(query.number, models)
             picture = made[job.sizes[model]][number]
-            cost, predicted = picture.traced * job.first_of_size[model], picture.predicted
-            evaluation = Evaluation.of(said[query.number], cost=cost, predicted=predicted, seconds=seconds)
+            cost = picture.traced * job.first_of_size[model]
+            evaluation = Evaluation.of(said[query.number], cost=cost, predicted=picture.predicted, seconds=seconds)
             if model == 0 and query.keep and (job.config.keep_pictures == "all" or number in wrong):
                 evaluation = replace(evaluation, small=thumbnails.thumbnail(picture.picture))
             if model == 0 and job.aovs:
@@ -330,19 +304,16 @@ class SweptScene:
 
     def _made(self, size: tuple[int, int], queries: Sequence[Query]) -> dict[int, SweptPicture]:
         """The pictures of one size, rounded to 8 bits, by their numbers."""
-        job, models, before = self.job, len(self.job.models), self.number * self.points[size].count
-        asked = {
-            query.number // models - before: query for query in queries if job.sizes[query.number % models] == size
-        }
+        models, before = len(self.job.models), self.number * self.points[size].count
+        shown = [query for query in queries if self.job.sizes[query.number % models] == size]
         with torch.no_grad():
-            made = self.predicted[size].pictures(asked)
+            made = self.predicted[size].pictures({query.number // models - before: query for query in shown})
         return {before + number: replace(swept, picture=to_8_bit(swept.picture)) for number, swept in made.items()}
 
-    def pictures(self, queries: Sequence[Query]) -> Tensor:
-        """Return the pictures (n, H, W, 3) of rows as the first model sees them."""
-        made, models = self._made(self.job.sizes[0], queries), len(self.job.models)
-        numbers = dict.fromkeys(query.number // models for query in queries)
-        return torch.stack([made[number].picture for number in numbers])
+    def picture(self, query: Query) -> Tensor:
+        """Return the picture (H, W, 3) that the first model is asked about."""
+        (made,) = self._made(self.job.sizes[0], [query]).values()
+        return made.picture
 
 
 class OpenScenes:
@@ -370,8 +341,8 @@ class OpenScenes:
 
     def picture(self, number: int) -> Tensor:
         """The picture (H, W, 3) as the first model sees it."""
-        scene, queries = self.asked(number)
-        return scene.pictures(queries)[0]
+        scene, (query, *_) = self.asked(number)
+        return scene.picture(query)
 
 
 def check_worst(

@@ -28,22 +28,14 @@ from advsearch.questions.sweep.figures import sweep_figure
 from advsearch.questions.sweep.job import KIND, Job, OpenScenes, check_all, check_worst
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.predicting import combined
-from advsearch.questions.sweep.result import (
-    FINISHED,
-    INTERRUPTED,
-    Predictions,
-    SweepResult,
-    SweptAxis,
-    counted_by_unit,
-    map_over,
-)
+from advsearch.questions.sweep.result import FINISHED, Predictions, SweepResult, SweptAxis, counted_by_unit, map_over
 from advsearch.questions.sweep.settings import BLIND
 from advsearch.questions.sweep.summary import WorstConfiguration, WorstVerified
 from advsearch.questions.sweep.surface import map_surface
 from advsearch.report.wording import count
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
 from advsearch.runs.files import write_bytes, write_layers
-from advsearch.runs.results import DescribedValue, Formation, LinearTransport, SharedWork
+from advsearch.runs.results import INTERRUPTED, DescribedValue, Formation, LinearTransport, SharedWork
 from advsearch.runs.store import Row
 from advsearch.runs.tables import EDGES, NOTE
 from advsearch.tasks import Judgement
@@ -52,9 +44,7 @@ from advsearch.viewer import thumbnails
 NOT_FINITE = "pictures not finite"  # the note under which the store keeps that there were some
 PICTURE_SPP = 64  # samples a pixel of the picture that is kept, unless verification needed more
 ENOUGH_DRIVES = 20  # of fewer, a sweep says what they could show at best
-
 TELL_SECONDS = 0.1
-
 MOST_METERED = 256  # scenes whose gains a summary lists; of more it has none
 DRAWN_AT_ONCE = 4096  # pictures whose draws are worked out at once for the tables
 
@@ -87,8 +77,7 @@ class Sweep:
 
     def carry_out(self, first: int | None = None) -> SweepResult:
         """Do what is left, or all from the configuration with a number on, and return the result."""
-        predictions = self._counted()
-        ending, worst = FINISHED, None
+        predictions, ending = self._counted(), FINISHED
         self._check_numbers()
         for text in self.job.warnings:
             self.stages.progress.message(text)
@@ -96,17 +85,8 @@ class Sweep:
             with interruptible():
                 left = [range(first, self.total)] if first is not None else self._left()
                 self._scenes.open(self._scene_of(left[0].start if left else self.total - 1))
-                samples = count(self.job.spp, "sample")
-                hint = f"{self.total} predictions, pictures of {samples} a pixel; `resolution`, `spp` or fewer points"
-                hint += " shorten it"
-                if self.run is not None and self.job.config.keep_pictures != "none":
-                    hint += f"; pictures that are kept take {self._pictures_text()}"
-                self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
-                self.stages.progress.advance(self.total - sum(map(len, left)))
                 self._go_through(left, predictions)
-                worst = self._claimed(predictions)
-                if worst is not None:
-                    worst = worst.model_copy(update=self._verified(worst))
+                worst = self._worst(predictions, verify=True)
                 if self.job.config.surface and self.run is not None:
                     self.stages.begin("surface", "tracing the surface that was seen", self.total)
                     self._surface = map_surface(self._scenes, self.rows(), self.run, self.stages.progress)
@@ -119,11 +99,9 @@ class Sweep:
         except KeyboardInterrupt:
             ending = INTERRUPTED
             predictions = self._counted()
-            worst = self._claimed(predictions)
+            worst = self._worst(predictions)
         self.stages.end()
         return self._finish(predictions, ending, worst)
-
-    # ---- the loop ---------------------------------------------------------------------------------------------------
 
     def _scene_of(self, configuration: int) -> int:
         return configuration // self.models // self.per_scene
@@ -132,6 +110,17 @@ class Sweep:
         return [range(self.total)] if self.run is None else list(self.run.store.missing(KIND, self.total))
 
     def _go_through(self, left: Sequence[range], predictions: Predictions) -> None:
+        hint = f"{self.total} predictions, pictures of {count(self.job.spp, 'sample')} a pixel; `resolution`, `spp` or "
+        hint += "fewer points shorten it"
+        keep = self.job.config.keep_pictures
+        if self.run is not None and keep != "none":
+            height, width = self.job.sizes[0]
+            share = min(1.0, thumbnails.SIDE / max(height, width)) ** 2 * height * width / thumbnails.SIDE**2
+            megabytes = self.total // self.models * thumbnails.BYTES * share / 1e6
+            size = f"{megabytes / 1e3:.1f} GB" if megabytes >= 1e3 else f"{max(megabytes, 0.1):.1f} MB"
+            hint += f"; pictures that are kept take {'about' if keep == 'all' else 'at most about'} {size}"
+        self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
+        self.stages.progress.advance(self.total - sum(map(len, left)))
         self._begun = time.monotonic()
         for done in self._executor.results(self._asked(left)):
             queries = [query for *_, query in done.items]
@@ -158,7 +147,6 @@ class Sweep:
         self.journal.rows.sort(key=lambda row: row.step)
 
     def _asked(self, left: Sequence[range]) -> Iterator[list[Sent]]:
-        """Yield what is asked in batches, each about one scene."""
         for part in left:
             first, last = part.start // self.models, -(-part.stop // self.models)
             while first < last:
@@ -167,13 +155,6 @@ class Sweep:
                     asked = self.job.queries(range(before + piece.start, before + piece.stop))
                     yield [one for one in asked if part.start <= one[2].number < part.stop]
                 first = before + self.per_scene
-
-    def _pictures_text(self) -> str:
-        height, width = self.job.sizes[0]
-        share = min(1.0, thumbnails.SIDE / max(height, width)) ** 2 * height * width / thumbnails.SIDE**2
-        megabytes = self.total // self.models * thumbnails.BYTES * share / 1e6
-        size = f"{megabytes / 1e3:.1f} GB" if megabytes >= 1e3 else f"{max(megabytes, 0.1):.1f} MB"
-        return f"about {size}" if self.job.config.keep_pictures == "all" else f"at most about {size}"
 
     def _check_numbers(self) -> None:
         """Look again at the first picture that is stored, where there is more to come here."""
@@ -202,10 +183,7 @@ class Sweep:
             self.stages.progress.advance(self._untold, **beside)
             self._told, self._untold = now, 0
 
-    # ---- counting ---------------------------------------------------------------------------------------------------
-
     def _counted(self) -> Predictions:
-        """What the rows say that are stored already, read one after the other."""
         predictions = Predictions(self.total)
         self._traced = self._predicted = self._lost = 0
         for row in self.rows():
@@ -229,9 +207,8 @@ class Sweep:
         job, (pictures, model) = self.job, np.divmod(numbers, self.models)
         scene, local = np.divmod(pictures, self.per_scene)
         axes = []
-        by = {"object": "object", "environment": "environment", "answer": "beside_clean"}
-        for what, attribute in by.items():
-            names = [getattr(place, attribute) for place in job.places]
+        for what in ("object", "environment", "answer"):
+            names = [place.names.get(what, "") for place in job.places]
             several = list(dict.fromkeys(names))
             axes.append(SweptAxis(what, "", several, np.array([several.index(name) for name in names])[scene]))
         axes.append(SweptAxis("model", "", [one.name for one in job.models], model))
@@ -239,31 +216,29 @@ class Sweep:
         of_the_grid = zip(job.axes, digits, strict=True)
         axes += [SweptAxis(one.name, one.unit, one.values, at, "grid") for one, at in of_the_grid]
         if self._shown and len(numbers):
-            until = int(pictures[-1]) + 1
-            scenes = (range(first, first + self.per_scene) for first in range(0, until, self.per_scene))
-            blocks = [one[k : k + DRAWN_AT_ONCE] for one in scenes for k in range(0, len(one), DRAWN_AT_ONCE)]
-            drawn = [self.points.parts_of(one.start, len(one)) for one in blocks if one.start < until]
+            scenes = range(0, int(pictures[-1]) + 1, self.per_scene)
+            blocks = [block for first in scenes for block in batches(first, first + self.per_scene, DRAWN_AT_ONCE)]
+            drawn = [self.points.parts_of(one.start, len(one)) for one in blocks if one.start <= pictures[-1]]
             parts = zip(self._shown, np.concatenate(drawn)[pictures].T, strict=True)
             axes += [SweptAxis(one.name, one.unit, one.parts, at, "drawn") for one, at in parts]
         return [one for one in axes if len(one.values) > 1]
 
-    # ---- the worst configuration ------------------------------------------------------------------------------------
-
-    def _claimed(self, predictions: Predictions) -> WorstConfiguration | None:
-        """What the sweep saw at its worst."""
+    def _worst(self, predictions: Predictions, verify: bool = False) -> WorstConfiguration | None:
+        """What the sweep saw at its worst; if asked, with what fresh renders say of it, and what the model says of the
+        picture that is kept."""
         index = predictions.worst
         if index is None:
             return None
         rows = self.journal.rows if self.run is None else [self.run.store.row(KIND, index)]
         row = next(row for row in rows if row is not None and row.step == index)
         number, model = divmod(index, self.models)
-        *_, query = self.job.queries(range(number, number + 1))[model]
+        query = self.job.queries(range(number, number + 1))[model][2]
         task, scene = self.job.tasks[model], self._scene_of(index)
         if task.varies:
             truth = self._scenes.open(scene).problems[model].truth(query.u, query.values)
         else:
-            truth = self.job.truth(self.job.places[scene], model, query.values)
-        return WorstConfiguration(
+            truth = task.truth(self.job.facts(self.job.places[scene], query.values))
+        worst = WorstConfiguration(
             configuration=index,
             values={name: DescribedValue.of(value) for name, value in query.values.items()},
             seed=query.seed,
@@ -271,25 +246,20 @@ class Sweep:
             claimed=_claim_of(judgement_of(row)),
             verified=None,
         )
-
-    def _verified(self, worst: WorstConfiguration) -> dict[str, object]:
-        """What fresh renders say of it, and what the model says of the picture that is kept."""
-        number, model = divmod(worst.configuration, self.models)
-        scene, queries = self._scenes.asked(number)
-        query, problem = queries[model], scene.problems[model]
+        if not verify:
+            return worst
+        problem = self._scenes.open(scene).problems[model]
         checked = check_worst(problem, self.job.config, query.u, self.run, self.stages)
         if self.run is None:
-            return {"verified": checked}
-        spp = max(PICTURE_SPP, checked.spp if checked else 0)
-        picture = problem.picture(query.u, worst.seed, spp)
+            return worst.model_copy(update={"verified": checked})
+        picture = problem.picture(query.u, worst.seed, max(PICTURE_SPP, checked.spp if checked else 0))
         self.run.save_image("worst", picture)
         save_marked(self.run, "worst", picture, problem.marks(picture, query.u))
-        return {"verified": checked, "pictured": _claim_of(problem.judge(picture, query.u))}
-
-    # ---- the result -------------------------------------------------------------------------------------------------
+        pictured = _claim_of(problem.judge(picture, query.u))
+        return worst.model_copy(update={"verified": checked, "pictured": pictured})
 
     def _finish(self, predictions: Predictions, ending: str, worst: WorstConfiguration | None) -> SweepResult:
-        job, seconds = self.job, self.stages.seconds
+        job, run, seconds = self.job, self.run, self.stages.seconds
         view, checked = self._scenes.scene, worst.verified if worst else None
         predicting = self._transport.values() or [[one.summary() for one in (view.predicted.values() if view else ())]]
         swept = seconds.get("sweep", 0.0)
@@ -304,8 +274,10 @@ class Sweep:
         numbers = np.flatnonzero(predictions.counted)
         right, units, axes = predictions.right[numbers], self.units.of(numbers), self._axes(numbers)
         changes = self._changes()
+        renders = {"sweep": self._traced, "verification": checked.renders if checked else 0}
+        pairs = predictions.beside(models, self.units) if adversarial else []
         summary = results.SweepSummary(
-            run=None if self.run is None else str(self.run.path),
+            run=None if run is None else str(run.path),
             object=job.config.object,
             model=",".join(models),
             task=job.config.task_name,
@@ -323,39 +295,33 @@ class Sweep:
             answers=predictions.frequent,
             axes=[row for axis in axes for row in axis.rows(right, units)],
             cells=map_over(axes, right, predictions.margin[numbers]),
-            beside=results.BesideClean(answer=adversarial, pairs=predictions.beside(models, self.units))
-            if adversarial
-            else None,
+            beside=results.BesideClean(answer=adversarial, pairs=pairs) if adversarial else None,
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
             sampler=job.config.sampler if self.points.draws else None,
             spp=job.spp,
-            renders={
-                "sweep": self._traced,
-                "verification": checked.renders if checked else 0,
-                **({"products": self._predicted} if self._predicted else {}),
-            },
+            renders={**renders, "products": self._predicted} if self._predicted else renders,
             transport=combined([one for light in predicting for one in light]),
             surface=self._surface,
             drives=self._drives,
-            changes=changes,
+            changes=changes or None,
             shared=SharedWork.of_facts(self._executor.facts, self.journal.machines),
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.config.seed,
-            warnings=[*job.warnings, *self._remarks(predictions, checked, changes or ())],
+            warnings=[*job.warnings, *self._remarks(predictions, checked, changes)],
             command_line=job.config.command_line(),
         )
-        if self.run is not None:
-            self.run.write_summary(summary)
+        if run is not None:
+            run.write_summary(summary)
             for suffix, data in sweep_figure(summary).items():
-                write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
-            write_sweep_page(self.run.path, summary)
-        return SweepResult(summary, None if self.run is None else self.run.path, tuple(self.journal.rows))
+                write_bytes(run.path / "images" / f"sweep.{suffix}", data)
+            write_sweep_page(run.path, summary)
+        return SweepResult(summary, None if run is None else run.path, tuple(self.journal.rows))
 
-    def _changes(self) -> list[results.ChangeRates] | None:
-        found: list[results.ChangeRates] = []
+    def _changes(self) -> list[results.ChangeRates]:
+        rates: list[results.ChangeRates] = []
         for claim, when in self.job.config.claims:
             held = {row.step: row.metrics[name] for row in self.rows() if (name := f"{claim} {when}") in row.metrics}
             for model, network in enumerate(self.job.models):
@@ -363,32 +329,28 @@ class Sweep:
                 right = np.array([held[one] == 1.0 for one in numbers.tolist()], dtype=bool)
                 counts = vars(counted_by_unit(right, self.units.of(numbers)))
                 row = int(numbers[~right][0]) if len(numbers) and not right.all() else None
-                found.append(results.ChangeRates(**counts, model=network.name, claim=claim, when=when, row=row))
-        return found or None
+                rates.append(results.ChangeRates(**counts, model=network.name, claim=claim, when=when, row=row))
+        return rates
 
     def _remarks(
         self, predictions: Predictions, checked: WorstVerified | None, changes: Sequence[results.ChangeRates]
-    ) -> list[str]:
-        remarks = [*lost_remarks(self._lost), *self.journal.remarks]
+    ) -> Iterator[str]:
+        yield from (*lost_remarks(self._lost), *self.journal.remarks)
         few = min((rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES)
         if few < ENOUGH_DRIVES:
-            remarks.append(
+            yield (
                 f"{count(few, 'drive')} can show little: were the model right in all their frames, the interval of "
                 f"that share would begin at {100 * most_shown(few):.0f} %."
             )
         if hidden := int(predictions.hidden.sum()):
-            remarks.append(
-                f"In {hidden} of {count(int(predictions.seen.sum()), 'picture')} nothing of the object is to be seen: "
-                "they are not counted."
-            )
+            seen = count(int(predictions.seen.sum()), "picture")
+            yield f"In {hidden} of {seen} nothing of the object is to be seen: they are not counted."
         if predictions.not_finite:
-            remarks.append(
-                f"{predictions.not_finite} predictions of the model are not numbers; they count as not right."
-            )
+            yield f"{predictions.not_finite} predictions of the model are not numbers; they count as not right."
         if self._not_finite:
-            remarks.append("Some values of pictures were not finite and were set to 0.")
+            yield "Some values of pictures were not finite and were set to 0."
         if checked and not checked.converged:
-            remarks.append(
+            yield (
                 f"It is not shown that the worst margin keeps its side beyond {checked.spp} samples a pixel, the most "
                 "that a check takes: noise may take part in it."
             )
@@ -396,8 +358,7 @@ class Sweep:
             if rates.claim == "must_change" and rates.interval is not None and rates.interval[1] < 0.5:
                 alike = f"{rates.configurations - rates.correct} of {rates.configurations} pictures"
                 text = f"{rates.model} says the same in {alike} when {BLIND[rates.when]}"
-                remarks.append(f"{text}: it may not be looking at the object.")
-        return remarks
+                yield f"{text}: it may not be looking at the object."
 
 
 def _claim_of(seen: Judgement) -> results.WorstClaim:

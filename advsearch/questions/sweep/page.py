@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 MOST_EMBEDDED = 3_000_000
 """Bytes of pictures that a page which needs no other file takes along; the worst predictions first."""
-
 MOST_ROWS = 200_000  # rows that such a page takes along; more are for `advsearch dashboard`
 
 
@@ -78,50 +77,37 @@ def sweep_page_html(runs: Sequence[tuple[Path, SweepSummary | None]], sources: S
     """Return the page of sweeps as HTML, of each its folder, its result (None where it has none yet) and what its
     explorer reads."""
     connects = any(isinstance(source.rows, str) or source.folder for source in sources)
-    summaries = [(path, summary) for path, summary in runs if summary is not None]
-    title = ", ".join(path.name for path, _ in runs)
-    described, data, left_out = [], [], []
-    shown = [(source, *run) for source, run in zip(sources, runs, strict=True) if source.rows is not None]
-    for number, (source, path, summary) in enumerate(shown):
-        described.append(_described(source, number) | _judged(path, summary))
+    described, data, left_out, stills, parts = [], list[Html](), list[Html](), list[Html](), list[Html | None]()
+    explored = [(source, *run) for source, run in zip(sources, runs, strict=True) if source.rows is not None]
+    for number, (source, path, summary) in enumerate(explored):
+        about: JsonObject = {"name": source.name, "parts": source.parts}
+        about |= {"embedded": f"rows-{number}"} if source.embedded else {"rows": source.rows}
         if source.embedded:
             zipped = base64.b64encode(gzip.compress(packed(source.rows), 6, mtime=0)).decode()
             data.append(element("script", Html(zipped), type="application/octet-stream", id=f"rows-{number}"))
-            pictures, kept = described[-1].get("pictures"), source.pictures
-            taken = pictures.get("embedded") if isinstance(pictures, dict) else None
-            if kept is not None and isinstance(taken, dict) and len(taken) < len(kept.numbers):
-                some = f"{len(taken):,} of the {len(kept.numbers):,} pictures that were kept"
-                left_out.append(element("p", f"This file has {some}, those of the worst margins.", class_="soft"))
-    parts = []
-    for path, summary in summaries:  # what is shown of a sweep on a page alone, and how it came about
-        given = shown_of(summary)
-        parts += [
-            part_html(path, part, given.said) for part in given.sections if part.only == "page" and not part.empty
-        ]
-        parts.append(end_html(path, summary, given))
-    main = element(
-        "main",
-        element("div", id="explorer", hidden="hidden") if shown else _too_many(runs),
-        *left_out,
-        *(_still(path, summary) for path, summary in summaries),
-        *parts,
-    )
+        if (kept := source.pictures) is not None:
+            pictures: JsonObject = {"models": kept.models}
+            if source.folder is not None:
+                pictures |= {"folder": source.folder, "suffix": "jpg", "kept": [*kept.numbers] if kept.some else None}
+            elif source.embedded:
+                taken: JsonObject = dict(kept.embedded(source.rows, MOST_EMBEDDED))
+                pictures["embedded"] = taken
+                if len(taken) < len(kept.numbers):
+                    some = f"{len(taken):,} of the {len(kept.numbers):,} pictures that were kept"
+                    left_out.append(element("p", f"This file has {some}, those of the worst margins.", class_="soft"))
+            about["pictures"] = pictures
+        described.append(about | _judged(path, summary))
+    for path, summary in runs:  # what is shown of a sweep on a page alone, and how it came about
+        if summary is not None:
+            stills.append(_still(path, summary))
+            shown = shown_of(summary)
+            of_a_page = [part for part in shown.sections if part.only == "page" and not part.empty]
+            parts += [*(part_html(path, part, shown.said) for part in of_a_page), end_html(path, summary, shown)]
+    explorer = element("div", id="explorer", hidden="hidden") if explored else _too_many(runs)
+    main = element("main", explorer, *left_out, *stills, *parts)
     data = [data_script(described, "runs"), *data]
+    title = ", ".join(path.name for path, _ in runs)
     return document(title, _header(runs), main, data=data, scripts=["sweep.js"], connects=connects)
-
-
-def _described(source: SweepSource, number: int) -> JsonObject:
-    described: JsonObject = {"name": source.name, "parts": source.parts}
-    described |= {"embedded": f"rows-{number}"} if source.embedded else {"rows": source.rows}
-    kept = source.pictures
-    if kept is None:
-        return described
-    pictures: JsonObject = {"models": kept.models}
-    if source.folder is not None:
-        pictures |= {"folder": source.folder, "suffix": "jpg", "kept": list(kept.numbers) if kept.some else None}
-    elif source.embedded:
-        pictures["embedded"] = dict(kept.embedded(source.rows, MOST_EMBEDDED))
-    return {**described, "pictures": pictures}
 
 
 def _judged(run: Path, summary: SweepSummary | None) -> JsonObject:
@@ -155,21 +141,15 @@ def _too_many(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
     """What stands in the explorer's place in a file that would take more rows along than it may."""
     served = shlex.join(["advsearch", "dashboard", *(directory.typed_name(path) for path, _ in runs)])
     counts = ", ".join(f"{summary.configurations:,}" for _, summary in runs if summary is not None)
-    return element(
-        "p",
-        f"This file leaves out the {counts} rows, and what pictures they have: it takes {MOST_ROWS:,} along at most. ",
-        element("code", served),
-        " explores them all, and so does the folder that ",
-        element("code", "advsearch view"),
-        " makes with its option ",
-        element("code", "bundle"),
-        ".",
-        class_="soft",
+    left = (
+        f"This file leaves out the {counts} rows, and what pictures they have: it takes {MOST_ROWS:,} along at most. "
     )
+    explores = [element("code", served), " explores them all, and so does the folder that "]
+    made = [element("code", "advsearch view"), " makes with its option ", element("code", "bundle"), "."]
+    return element("p", left, *explores, *made, class_="soft")
 
 
 def sweep_verdict(summary: SweepSummary) -> str:
-    """Return what a sweep came to, in one sentence."""
     if not summary.configurations:
         return "The object is in no picture." if summary.out_of_view else "No configuration was looked at."
     if summary.beside and summary.beside.pairs:
@@ -234,19 +214,16 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
             return write_text(folder / INDEX, page_of(run, result))
         if len(sweeps) < len(results):
             raise InputError("bundle: one run or several sweeps make a page; give one kind of them")
-        sources = [_copied(run, folder, number) for number, (run, _) in enumerate(sweeps)]
+        sources = list[SweepSource]()
+        for number, (run, _) in enumerate(sweeps):
+            # a page that was opened by a double click may load pictures beside it, and no rows
+            columns, pictures, rows = read_columns(run), f"pictures-{number}", f"rows-{number}.bin"
+            embedded = len(columns) <= MOST_ROWS
+            if not embedded:
+                write_bytes(folder / rows, packed(columns))
+            kept = kept_pictures(run)
+            for picture in kept.numbers if kept else ():
+                place = path_of(folder / pictures, picture)
+                write_bytes(folder / pictures / place.parent.name / place.name, read_thumbnail(run, picture))
+            sources.append(SweepSource(run.name, columns if embedded else rows, pictures=kept, folder=pictures))
         return write_text(folder / INDEX, sweep_page_html(sweeps, sources))
-
-
-def _copied(run: Path, folder: Path, number: int) -> SweepSource:
-    """Write the thumbnails of a sweep into the folder, and its rows where a page would be too large with them, and say
-    where they are. A page that was opened by a double click may load pictures beside it, and no rows."""
-    columns, pictures, rows = read_columns(run), f"pictures-{number}", f"rows-{number}.bin"
-    embedded = len(columns) <= MOST_ROWS
-    if not embedded:
-        write_bytes(folder / rows, packed(columns))
-    kept = kept_pictures(run)
-    for picture in kept.numbers if kept else ():
-        place = path_of(folder / pictures, picture)
-        write_bytes(folder / pictures / place.parent.name / place.name, read_thumbnail(run, picture))
-    return SweepSource(run.name, columns if embedded else rows, pictures=kept, folder=pictures)

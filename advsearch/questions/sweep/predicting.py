@@ -274,7 +274,7 @@ class PredictedSweep:
 
     def _configuration(self, number: int, place: int) -> Tensor:
         member = self._groups.member(number, place)
-        return self.points.configurations(self.points.picks(member, 1, self.before))[0]
+        return self.points.configurations(member, 1, self.before)[0]
 
     @property
     def not_finite(self) -> int:
@@ -305,14 +305,10 @@ def combined(found: Sequence[LinearTransport | None]) -> LinearTransport | None:
     used = [one for one in told if one.used]
     if not used:
         return told[-1] if told else None
-    errors = [one.error for one in used if one.error is not None]
-    return LinearTransport(
-        used=True,
-        way=next((one.way for one in used if one.way), None),
-        reason=next((one.reason for one in used if one.reason), None),
-        entries=0,
-        bytes=max(one.bytes or 0 for one in used),
-        seconds=math.fsum(one.seconds or 0.0 for one in used),
-        renewed=0,
-        error=max(errors, key=lambda one: one.levels or 0.0) if errors else None,
-    )
+    worst = {
+        "reason": next((one.reason for one in used if one.reason), None),
+        "bytes": max(one.bytes or 0 for one in used),
+        "seconds": math.fsum(one.seconds or 0.0 for one in used),
+        "error": max((one.error for one in used if one.error), key=lambda error: error.levels or 0.0, default=None),
+    }
+    return used[0].model_copy(update=worst)

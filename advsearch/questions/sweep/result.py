@@ -33,22 +33,16 @@ from advsearch.runs.tables import Units, read_sweep, to_pandas
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 
-FINISHED, INTERRUPTED = "finished", "interrupted"
-
+FINISHED = "finished"
 MOST_CELLS = 4096  # cells of a map; with more pairs of values there is none
 MOST_PREDICTIONS = 20  # wrong predictions that the summary lists, the most frequent first
 
 
-def counted(right: npt.ArrayLike, of: npt.ArrayLike) -> CountedPredictions:
-    """Return count, accuracy and its 95 % interval, from right predictions and predictions of each unit (n,)."""
-    seen = int(np.sum(of))
-    return rate(int(np.sum(right)), seen, share_interval(right, of) if seen else None)
-
-
 def counted_by_unit(right: npt.ArrayLike, units: npt.NDArray[np.int64]) -> CountedPredictions:
-    """Return that of predictions (n,) that are of some units (n,)."""
+    """Return count, accuracy and its 95 % interval of predictions (n,) that are of some units (n,)."""
     right = np.asarray(right)
-    return counted(per_unit(right, units), per_unit(np.ones(len(right)), units))
+    of = per_unit(np.ones(len(right)), units)
+    return rate(int(right.sum()), len(right), share_interval(per_unit(right, units), of) if len(right) else None)
 
 
 def rate(correct: int, seen: int, interval: tuple[float, float] | None = None) -> CountedPredictions:
@@ -110,12 +104,11 @@ class Predictions:
             before, after = self.right.reshape(halves)[:, known, model]
             draws = units.draw(known)
             difference, interval, _ = paired_by_unit(before, after, draws)
-            of = per_unit(np.ones(len(known)), draws)
             pairs.append(
                 PairedRates(
                     model=name,
-                    clean=counted(per_unit(before, draws), of),
-                    answer=counted(per_unit(after, draws), of),
+                    clean=counted_by_unit(before, draws),
+                    answer=counted_by_unit(after, draws),
                     both=int((before & after).sum()),
                     clean_only=int((before & ~after).sum()),
                     answer_only=int((~before & after).sum()),
@@ -224,8 +217,9 @@ class SweepResult:
 
     def __repr__(self) -> str:
         right = f"{self.summary.correct} of {self.summary.configurations} right"
-        place = self.run and str(self.run)
-        return f"SweepResult({self.summary.object!r}, {self.summary.model!r}, {right}, run={place!r})"
+        return (
+            f"SweepResult({self.summary.object!r}, {self.summary.model!r}, {right}, run={self.run and str(self.run)!r})"
+        )
 
     def _repr_html_(self) -> str:
         return result_html(shown(self.summary))
@@ -268,35 +262,29 @@ def _summary_of(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
         names = rows[name].unique().tolist() if name in rows else []
         more = f" and {len(names) - 20} more" if len(names) > 20 else ""
         called[name] = ",".join(map(str, names[:20])) + more or "unknown"
+    not_told = dict.fromkeys(("image_formation", "cells", "worst", "sampler", "renders_per_second"))
     return SweepSummary(
         run=str(run),
         **called,
+        **vars(rate(int(right.sum()), len(rows))),
+        **not_told,
+        **dict.fromkeys(("not_finite", "spp", "seed"), 0),
         task="classification",
         controls=[],
         ending=FINISHED,
-        image_formation=None,
         planned=len(rows),
-        **vars(rate(int(right.sum()), len(rows))),
-        not_finite=0,
         answers=dict(Counter(rows["label"][~right]).most_common(MOST_PREDICTIONS)),
         axes=tables,
-        cells=None,
-        worst=None,
         grid={},
         samples=1,
-        sampler=None,
-        spp=0,
         renders={"sweep": len(rows)},
-        renders_per_second=None,
         seconds={"total": 0.0},
-        seed=0,
         warnings=[f"Read from {folder}, as 3DB wrote it; it was not rendered here."],
         command_line="",
     )
 
 
 def read_picture(path: Path) -> object:
-    """Return the picture (H, W, 3) in [0, 1] in a file."""
     with opened(path, LARGEST_FILE) as image:
         check_pixels(path, *image.size, MOST_PIXELS)
         return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)

@@ -26,7 +26,6 @@ HARMLESS = {
     "jpeg": "the picture is a JPEG file of quality 95",
 }
 """Changes that mean nothing: it says the same."""
-
 Grid = dict[str, object]  # values, or numbers of them, by the parameters of the grid
 
 
@@ -162,7 +161,6 @@ class SweepConfig(SceneConfig):
 
     @property
     def environments(self) -> tuple[str, ...]:
-        """The environments by name."""
         return split_names(self.lit_by)
 
     @classmethod
@@ -192,21 +190,20 @@ class SweepConfig(SceneConfig):
         """Accept any sequence of values from Python (a range, an array), and ``a,b,c``; FIRST:LAST:COUNT stays text."""
         if not isinstance(value, Mapping):
             return value
-        return {str(name): _grid_values(given) for name, given in value.items()}
-
-
-def _grid_values(given: Any) -> Any:
-    """The values of one axis as a list, or FIRST:LAST:COUNT as text."""
-    if isinstance(given, Mapping) and set(given) == {"choices"}:
-        given = given["choices"]
-    if isinstance(given, str):
-        text = given.strip().removeprefix("[").removesuffix("]")
-        if ":" in text and "," not in text:
-            return text
-        given = [part.strip() for part in text.split(",") if part.strip()]
-    given = given.tolist() if hasattr(given, "tolist") else given
-    given = given if isinstance(given, (range, tuple, list)) else [given]
-    values = [value.item() if hasattr(value, "item") else value for value in given]
-    if not values or any(value is None or isinstance(value, (bool, list, Mapping)) for value in values):
-        raise ValueError("not values")
-    return [number_or_text(value) for value in values]
+        axes: dict[str, Any] = {}
+        for name, listed in value.items():
+            if isinstance(listed, Mapping) and set(listed) == {"choices"}:
+                listed = listed["choices"]
+            if isinstance(listed, str):
+                text = listed.strip().removeprefix("[").removesuffix("]")
+                if ":" in text and "," not in text:
+                    axes[str(name)] = text
+                    continue
+                listed = [part.strip() for part in text.split(",") if part.strip()]
+            listed = listed.tolist() if hasattr(listed, "tolist") else listed
+            listed = listed if isinstance(listed, (range, tuple, list)) else [listed]
+            values = [entry.item() if hasattr(entry, "item") else entry for entry in listed]
+            if not values or any(entry is None or isinstance(entry, (bool, list, Mapping)) for entry in values):
+                raise ValueError("not values")
+            axes[str(name)] = [number_or_text(entry) for entry in values]
+        return axes

@@ -6,17 +6,13 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
+from advsearch.runs import results
 from advsearch.runs.results import (
-    DescribedValue,
     Fields,
-    Formation,
     Interval,
     JsonFloat,
-    LinearTransport,
     Payload,
     RunResult,
-    SharedWork,
-    VariedValue,
     VerifiedRate,
     as_fact,
     having,
@@ -82,7 +78,7 @@ class WorstConfiguration(Fields):
     """The configuration with the smallest margin."""
 
     configuration: int = Field(description="its number")
-    values: Annotated[dict[str, DescribedValue], having("object", "model")]
+    values: Annotated[dict[str, results.DescribedValue], having("object", "model")]
     seed: int
     label_set: list[str] = Field(description="the names that count as right there")
     claimed: WorstClaim = Field(description="of the sweep's own picture")
@@ -220,7 +216,7 @@ class SweepSummary(CountedPredictions, RunResult):
     object: str
     model: str
     task: str = Field(description="what judges the predictions")
-    image_formation: Formation | None
+    image_formation: results.Formation | None
     planned: int = Field(description="how many configurations there are")
     out_of_view: int = Field(
         default=0,
@@ -249,7 +245,7 @@ class SweepSummary(CountedPredictions, RunResult):
     )
     grid: dict[str, int] = Field(description="how many values each axis of the grid has")
     gains: dict[str, float] | None = optional("the gain of each scene, by object and environment; absent of one scene")
-    drawn: dict[str, VariedValue] = Field(
+    drawn: dict[str, results.VariedValue] = Field(
         default={}, description="what each value was drawn from, of parameters of few numbers"
     )
     samples: int = Field(description="draws at each point of the grid")
@@ -258,14 +254,14 @@ class SweepSummary(CountedPredictions, RunResult):
     renders: Annotated[dict[str, int], having("sweep")] = Field(
         description="of the sweep and of the verification; `products`: predicted instead"
     )
-    transport: LinearTransport | None = optional(
+    transport: results.LinearTransport | None = optional(
         "whether [basis pictures](transport.md#light) or [light on surfaces](surface-light.md#sweeps) "
         "predicted pictures; absent where neither light nor camera moves"
     )
     surface: SurfaceMap | None = optional(
         "which parts of the [surface](sweeps.md#the-surface), when seen, go with wrong predictions; absent unless asked"
     )
-    shared: SharedWork | None = optional("how [workers](cluster.md) did that shared the work; absent without")
+    shared: results.SharedWork | None = optional("how [workers](cluster.md) did that shared the work; absent without")
     renders_per_second: float | None = Field(
         description="pictures of the sweep; null where nothing was rendered now", json_schema_extra=as_fact("{:.3g}")
     )
@@ -278,7 +274,6 @@ class SweepSummary(CountedPredictions, RunResult):
 
     @property
     def brief(self) -> str:
-        """How many are right; beside an adversarial scene, that without and with it."""
         if self.beside and self.beside.pairs:
             rates = self.beside.pairs[0]
             return f"accuracy {rates.clean.accuracy:.1%}, {rates.answer.accuracy:.1%} with {self.beside.answer}"

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from math import ceil
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 import torch
 from scipy.special import xlogy
 
@@ -23,10 +24,11 @@ from advsearch.attacks.trials import wilson
 from advsearch.engine.loading import framed, load_scene
 from advsearch.engine.record import judgement_of
 from advsearch.progress import Progress
-from advsearch.questions.sweep.figures import MapView, SurfacePanel, surface_figure
 from advsearch.questions.sweep.job import OpenScenes
 from advsearch.questions.sweep.result import rate
 from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTable
+from advsearch.report.figures import drawn
+from advsearch.report.wording import short_name
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import Row
@@ -39,7 +41,6 @@ from advsearch.scene.surfaces import Surfaces
 
 Counts = npt.NDArray[np.int64]
 Doubles = npt.NDArray[np.float64]
-
 SHARINGS = 199  # how often the wrong predictions are shared out anew, so that no p-value is under 0.005
 LEVEL = 0.05  # where no part has to do with the predictions, the chance that any is told from chance
 
@@ -71,47 +72,31 @@ class PartCounts:
         self.chance[np.ix_(np.flatnonzero(drawn), parts)] += 1
 
 
-@dataclass(frozen=True, eq=False)
-class Association:
-    """What n parts have to do with the predictions, (n,) each, NaN where a part was not compared: the share of wrong
-    predictions where it holds less that where it does not, both ends of the 95 % interval for the part by itself, and
-    how likely it is that by chance any part stands out as far."""
-
-    compared: npt.NDArray[np.bool_]
-    difference: Doubles
-    low: Doubles
-    high: Doubles
-    p: Doubles
-
-    @property
-    def told(self) -> npt.NDArray[np.bool_]:
-        """(n,): which parts are told from chance."""
-        return np.nan_to_num(self.p, nan=1.0) <= LEVEL
-
-    @property
-    def strength(self) -> Doubles:
-        """(n,) the end of the interval that is nearer to 0, without its sign; 0 where the interval contains 0. Without
-        an interval, how large the difference is."""
-        nearer = np.where(np.isnan(self.low), np.abs(self.difference), np.maximum(self.low, -self.high))
-        return np.nan_to_num(np.maximum(nearer, 0.0), nan=0.0)
-
-
-def association(tally: PartCounts, some: slice, least: int) -> Association:
+def association(tally: PartCounts, some: slice, least: int) -> pd.DataFrame:
     """Compare the predictions where each of some parts holds with those where it does not; at least so many pictures of
-    either kind."""
+    either kind.
+
+    Of each part, by its number, NaN where it was not `compared`: the `difference` of the share of wrong predictions
+    where it holds less that where it does not, both ends of the 95 % interval (`low`, `high`) for the part by itself,
+    and how likely it is that by chance any part stands out as far (`p`); whether it is `told` from chance; and as its
+    `strength` the end of the interval that is nearer to 0, without its sign; 0 where the interval contains 0. Without
+    an interval that is how large the difference is.
+    """
     seen, wrong, pictures, failures = tally.seen[some], tally.wrong[some], tally.pictures, tally.failures
     compared = (seen >= least) & (pictures - seen >= least)
-    low, high, difference, p = np.full((4, len(seen)), np.nan)
+    columns = dict.fromkeys(("difference", "low", "high", "p"), np.nan)
+    parts = pd.DataFrame(columns, index=np.arange(len(tally.seen))[some]).assign(compared=compared)
     if compared.any():
         n, k = seen[compared], wrong[compared]
-        difference[compared], low[compared], high[compared] = _newcombe(k, n, failures - k, pictures - n)
-        own = _likelihood_ratio(k, n, failures, pictures)
-        shared = (one[some][compared].astype(np.int64) for one in tally.chance)
-        most = np.sort([_likelihood_ratio(one, n, failures, pictures).max() for one in shared])
+        difference, low, high = _newcombe(k, n, failures - k, pictures - n)
         if tally.exchanged is not None:
-            low[compared] = high[compared] = np.nan
-        p[compared] = (1 + len(most) - np.searchsorted(most, own - 1e-9)) / (1 + len(most))
-    return Association(compared, difference, low, high, p)
+            low = high = np.full(len(n), np.nan)
+        dealt = (shared[some][compared].astype(np.int64) for shared in tally.chance)
+        most = np.sort([_likelihood_ratio(wrongs, n, failures, pictures).max() for wrongs in dealt])
+        above = len(most) - np.searchsorted(most, _likelihood_ratio(k, n, failures, pictures) - 1e-9)
+        parts.loc[compared, list(columns)] = np.stack([difference, low, high, (1 + above) / (1 + len(most))], axis=1)
+    nearer = np.where(parts.low.isna(), parts.difference.abs(), np.maximum(parts.low, -parts.high))
+    return parts.assign(told=parts.p <= LEVEL, strength=np.nan_to_num(np.maximum(nearer, 0.0)))
 
 
 def _likelihood_ratio(k: Counts, n: Counts, failures: int, pictures: int) -> Doubles:
@@ -120,8 +105,7 @@ def _likelihood_ratio(k: Counts, n: Counts, failures: int, pictures: int) -> Dou
     counts = (k, n - k, failures - k, pictures - n - failures + k)
     sums = (n, pictures - n, np.array(failures), np.array(pictures - failures))
     told = xlogy(pictures, pictures) + sum(xlogy(one, one) for one in counts) - sum(xlogy(one, one) for one in sums)
-    result: Doubles = 2.0 * told
-    return result
+    return np.asarray(2.0 * told)
 
 
 def _newcombe(k: Counts, n: Counts, others: Counts, rest: Counts) -> tuple[Doubles, Doubles, Doubles]:
@@ -133,22 +117,15 @@ def _newcombe(k: Counts, n: Counts, others: Counts, rest: Counts) -> tuple[Doubl
 
 
 LEAST = 5  # pictures that have to see a part, and as many that do not, before its predictions are compared
-
 RAYS = 4 * CELLS
 """Least number of rays along each side of a picture: in smaller ones, many cells would lie between two pixels."""
-
 STRONGEST = 5
 """Parts of each kind that the summary lists: so many that go with wrong predictions, and so many with right ones."""
-
 APART = 0.1  # distance of two listed parts, in units of the object's largest extent, so that one spot is listed once
-
 FILE = "artifacts/surface.npz"
-
 SIDES = ((0.0, 20.0), (90.0, 20.0), (180.0, 20.0), (270.0, 20.0), (0.0, 80.0), (0.0, -60.0))
 """Azimuth and elevation of the cameras that show the object in colours, degrees."""
-
 SIDE_PIXELS = 240
-
 UNKNOWN = -1  # stands for the prediction of a picture of which there is no row
 AT_ONCE = 16  # pictures whose places are worked out at once
 
@@ -170,56 +147,46 @@ class SurfaceCounts:
         for model, failed in wrong.items():
             self.tallies[model].add(seen, failed)
 
-    def compared(self, model: int) -> dict[str, Association]:
-        """Return what a model's predictions have to do with each part that is seen, by the kind of part."""
-        return {kind: association(self.tallies[model], some, LEAST) for kind, some in self.parts.kinds.items()}
-
-    def table(self, name: str, model: str, tally: PartCounts, kind: str, found: Association) -> SurfaceTable:
-        some = self.parts.kinds[kind]
+    def table(self, name: str, model: str, tally: PartCounts, kind: str, compared: pd.DataFrame) -> SurfaceTable:
+        """Return what a model's predictions have to do with the parts of a kind. Listed are those that are told from
+        chance most clearly, none close to another: those that go with wrong predictions, and then with right ones."""
+        extent = float(np.ptp(self.parts.mesh.vertices, axis=0).max())
+        strongest = list[SurfacePart]()
+        for side in (compared.difference > 0.0, compared.difference < 0.0):
+            listed: list[int] = []
+            for part in compared[compared.told & side].sort_values("strength", ascending=False, kind="stable").index:
+                away = np.linalg.norm(self.parts.place[listed] - self.parts.place[part], axis=1)
+                if away.min(initial=np.inf) >= APART * extent:
+                    listed.append(int(part))
+                if len(listed) == STRONGEST:
+                    break
+            for part in listed:
+                seen, wrong = int(tally.seen[part]), int(tally.wrong[part])
+                hidden, others = tally.pictures - seen, tally.failures - wrong
+                u, v = self.parts.at[part].tolist()
+                strongest.append(
+                    SurfacePart(
+                        face=int(self.parts.face[part]),
+                        u=u,
+                        v=v,
+                        place=self.parts.place[part].tolist(),
+                        seen=rate(seen - wrong, seen),
+                        hidden=rate(hidden - others, hidden),
+                        difference=float(compared.difference[part]),
+                        interval=(float(compared.low[part]), float(compared.high[part])),
+                        p=float(compared.p[part]),
+                    )
+                )
         return SurfaceTable(
             object=name,
             model=model,
             part=kind,
             unwrapped=self.parts.unwrapped,
-            seen=int((tally.seen[some] > 0).sum()),
-            compared=int(found.compared.sum()),
-            worse=int((found.told & (found.difference > 0)).sum()),
-            better=int((found.told & (found.difference < 0)).sum()),
-            strongest=[self._part(number, some.start, tally, found) for number in self._strongest(some.start, found)],
-        )
-
-    def _strongest(self, first: int, found: Association) -> list[int]:
-        """The parts that are told from chance most clearly, none close to another: those that go with wrong
-        predictions, and then those that go with right ones."""
-        extent = float(np.ptp(self.parts.mesh.vertices, axis=0).max())
-        order, strongest = np.argsort(-found.strength, kind="stable"), list[int]()
-        for side in (found.difference > 0.0, found.difference < 0.0):
-            of_side: list[int] = []
-            for number in order[(found.told & side)[order]]:
-                places = self.parts.place[[first + other for other in of_side]]
-                away = np.linalg.norm(places - self.parts.place[first + number], axis=1)
-                if away.min(initial=np.inf) >= APART * extent:
-                    of_side.append(int(number))
-                if len(of_side) == STRONGEST:
-                    break
-            strongest += of_side
-        return strongest
-
-    def _part(self, number: int, first: int, tally: PartCounts, found: Association) -> SurfacePart:
-        part = first + number
-        seen, wrong = int(tally.seen[part]), int(tally.wrong[part])
-        hidden, others = tally.pictures - seen, tally.failures - wrong
-        u, v = self.parts.at[part].tolist()
-        return SurfacePart(
-            face=int(self.parts.face[part]),
-            u=u,
-            v=v,
-            place=self.parts.place[part].tolist(),
-            seen=rate(seen - wrong, seen),
-            hidden=rate(hidden - others, hidden),
-            difference=float(found.difference[number]),
-            interval=(float(found.low[number]), float(found.high[number])),
-            p=float(found.p[number]),
+            seen=int((tally.seen[self.parts.kinds[kind]] > 0).sum()),
+            compared=int(compared.compared.sum()),
+            worse=int((compared.told & (compared.difference > 0)).sum()),
+            better=int((compared.told & (compared.difference < 0)).sum()),
+            strongest=strongest,
         )
 
 
@@ -246,8 +213,8 @@ def map_surface(scenes: OpenScenes, rows: Iterable[Row], run: RunDirectory, prog
         for some in batches(0, per_scene, AT_ONCE):
             for size in dict.fromkeys(job.sizes):
                 asked = [model for model in range(models) if job.sizes[model] == size]
-                picks = view.points[size].picks(some.start, len(some), scene * per_scene)
-                us, fineness = view.points[size].configurations(picks), ceil(RAYS / min(size))
+                us = view.points[size].configurations(some.start, len(some), scene * per_scene)
+                fineness = ceil(RAYS / min(size))
                 seen = (view.renderers[size].surfaces(u, fineness) for u in us)
                 for said, shown in zip(pictures[some.start : some.stop], seen, strict=True):
                     mine.add(shown, {model: bool(said[model]) for model in asked if said[model] != UNKNOWN})
@@ -275,29 +242,56 @@ def _written(
     arrays: dict[str, Any] = {"objects": np.array(list(counts)), "models": np.array(models)}
     for number, (name, mine) in enumerate(counts.items()):
         parts, views = mine.parts, tuple(_views(assets[name], mine.parts))
-        found = [mine.compared(model) for model in range(len(models))]
+        compared = [
+            {kind: association(tally, some, LEAST) for kind, some in parts.kinds.items()} for tally in mine.tallies
+        ]
         for what in ("pictures", "failures", "seen", "wrong"):
-            arrays[f"{what}_{number}"] = np.stack([getattr(one, what) for one in mine.tallies])
+            arrays[f"{what}_{number}"] = np.stack([getattr(tally, what) for tally in mine.tallies])
         for what in ("difference", "low", "high", "p"):
-            joined = [np.concatenate([getattr(one, what) for one in kinds.values()]) for kinds in found]
+            joined = [np.concatenate([frame[what] for frame in kinds.values()]) for kinds in compared]
             arrays[f"{what}_{number}"] = np.stack(joined).astype(np.float32)
         arrays[f"map_{number}"] = parts.corners.astype(np.float32)
-        for model, tally, kinds in zip(models, mine.tallies, found, strict=True):
+        for model, tally, kinds in zip(models, mine.tallies, compared, strict=True):
             cells = kinds["cell"]
-            surface = parts.covered | (tally.seen[parts.kinds["cell"]] > 0).reshape(CELLS, CELLS)
-            difference = np.where(cells.told, cells.difference, np.nan).reshape(CELLS, CELLS)
-            compared = cells.compared.reshape(CELLS, CELLS)
-            panels.append(SurfacePanel(name, model, surface, compared, difference, views))
-            tables += [mine.table(name, model, tally, kind, one) for kind, one in kinds.items()]
+            there = parts.covered.ravel() | (tally.seen[parts.kinds["cell"]] > 0)
+            colours = np.where(cells.compared.to_numpy()[:, None], UNTOLD, UNCOMPARED)
+            colours = np.where(there[:, None], colours, NOTHING)
+            title = f"{short_name(name)}, {short_name(model)}"
+            panels.append(Panel(title, colours, cells.difference.where(cells.told).to_numpy(), views))
+            tables += [mine.table(name, model, tally, kind, frame) for kind, frame in kinds.items()]
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)
     write_bytes(run.path / FILE, stream.getvalue())
-    for suffix, data in surface_figure(panels).items():
+    panels = panels[:MOST_PANELS]
+    for suffix, data in drawn(partial(_draw, panels), (10.0, 0.5 + 3.6 * len(panels)), kinds=("png",)).items():
         write_bytes(run.path / "images" / f"surface.{suffix}", data)
     return SurfaceMap(file=FILE, cells=CELLS, least=LEAST, tables=tables)
 
 
-def _views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
+MOST_PANELS = 12  # objects times models that are drawn; the file of the counts has all
+LIGHT = (0.36, 0.48, 0.80)  # the direction that the object is shaded from, world space; of length 1
+COLOURS = "PuOr_r"
+"""ColorBrewer's purple to orange, which people see apart who see no red or no green: orange is wrong more often."""
+UNTOLD, UNCOMPARED, NOTHING = (0.78, 0.78, 0.78), (0.45, 0.45, 0.45), (1.0, 1.0, 1.0)
+"""Grey where a part is not told from chance, darker where too few pictures show it or do not; white beside charts."""
+ROWS = 2  # rows of the views of an object
+
+View = tuple[str, Counts, Doubles]
+"""What a camera sees of an object: where it stands; the number of the cell in each pixel (H, W), -1 beside the object;
+and how bright that is (H, W)."""
+
+
+class Panel(NamedTuple):
+    """What is drawn of one object and one model: the colours (cells, 3) of what is not told from chance, and by how
+    much predictions are wrong more often where a cell is seen, NaN where that is not told, (cells,)."""
+
+    title: str
+    colours: Doubles
+    difference: Doubles
+    views: tuple[View, ...]
+
+
+def _views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[View]:
     alone = framed(load_scene(asset, settings={"ground.size": 0.0}).description, SIDE_PIXELS)
     scene = MitsubaScene(alone, (SIDE_PIXELS, SIDE_PIXELS))
     for azimuth, elevation in SIDES:
@@ -306,4 +300,38 @@ def _views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
         there = shown.seen(OBJECT).numpy()
         cells = np.full(there.shape, -1, np.int64)
         cells[there] = parts.cells(shown.face.numpy()[there], shown.uv.numpy()[there].astype(np.float64))
-        yield MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shown.normal.numpy())
+        shade = 0.7 + 0.3 * np.clip(shown.normal.numpy() @ np.array(LIGHT), 0.0, 1.0)
+        yield f"{azimuth:g}°, {elevation:g}° up", cells, shade
+
+
+def _draw(panels: Sequence[Panel], figure: Any) -> None:
+    """Draw a row for each panel, at one scale: the map, and the object in its colours from some sides."""
+    import matplotlib as mpl  # takes long to import
+
+    largest = max((float(np.nanmax(np.abs(one.difference), initial=0.0)) for one in panels), default=0.0)
+    end = max(ceil(10.0 * largest - 1e-9) / 10.0, 0.1)
+    scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(-end, end), mpl.colormaps[COLOURS])
+    axes = figure.subplots(len(panels), 2, squeeze=False, width_ratios=(1.0, 1.55))
+    for (flat, solid), (title, greys, difference, views) in zip(axes, panels, strict=True):
+        colours = np.where(np.isnan(difference)[:, None], greys, scale.to_rgba(difference)[:, :3])
+        flat.imshow(colours.reshape(CELLS, CELLS, 3), extent=(0, 1, 0, 1), interpolation="nearest")
+        flat.set(xlabel="u", ylabel="v")
+        flat.set_title(title)
+        solid.axis("off")
+        across = ceil(len(views) / ROWS)
+        mosaic = np.ones((ROWS * SIDE_PIXELS, across * SIDE_PIXELS, 3))  # white beside the object
+        for number, (side, cells, shade) in enumerate(views):
+            row, column = (SIDE_PIXELS * at for at in divmod(number, across))
+            worn = np.where(cells[..., None] >= 0, colours[np.maximum(cells, 0)] * shade[..., None], 1.0)
+            mosaic[row : row + SIDE_PIXELS, column : column + SIDE_PIXELS] = worn
+            solid.text(column + 0.5 * SIDE_PIXELS, row + 4, side, ha="center", va="top", fontsize=7)
+        solid.imshow(mosaic)
+
+    def percent(value: float, _: object) -> str:
+        return f"{100.0 * value:+.3g} %" if value else "0 %"
+
+    bar = figure.colorbar(scale, ax=axes, shrink=0.8 if len(panels) == 1 else 0.4, format=percent)
+    bar.set_label("share of wrong predictions where it is seen,\nless that where it is not")
+    texts = {UNTOLD: "not told from chance", UNCOMPARED: "too few pictures with or without it"}
+    marks = [mpl.patches.Patch(facecolor=colour, label=text) for colour, text in texts.items()]
+    figure.legend(handles=marks, loc="outside lower center", ncols=2)

@@ -73,13 +73,12 @@ class ConstantVelocity:
         for sure in (True, False):
             left = boxes[(scores >= self.sure) == sure]
             table = np.array([overlaps(left, one.box) for one in waiting]).reshape(len(waiting), len(left))
-            pairs = [(a, b) for a, b in zip(*linear_sum_assignment(-table), strict=True) if table[a, b] >= self.overlap]
-            for a, b in pairs:
+            pairs = {a: b for a, b in zip(*linear_sum_assignment(-table), strict=True) if table[a, b] >= self.overlap}
+            for a, b in pairs.items():
                 before = waiting[a].box - waiting[a].speed * waiting[a].missed
                 seen.append(_Track(waiting[a].number, left[b], (left[b] - before) / waiting[a].missed))
-            taken, found = {a for a, _ in pairs}, {b for _, b in pairs}
-            waiting = [one for number, one in enumerate(waiting) if number not in taken]
-            new += [box for number, box in enumerate(left) if number not in found and sure]
+            waiting = [track for number, track in enumerate(waiting) if number not in pairs]
+            new += [box for number, box in enumerate(left) if number not in pairs.values() and sure]
         seen += [_Track(next(self._numbers), box, np.zeros(4)) for box in new]
         self._tracks = [*seen, *(one for one in waiting if one.missed <= self.patience)]
         return [(one.number, one.box) for one in seen]
@@ -87,18 +86,14 @@ class ConstantVelocity:
 
 def overlaps(boxes: Doubles, box: Doubles) -> Doubles:
     """Return intersection over union of boxes (n, 4) with one box (4,), (n,)."""
-    found: Doubles = overlap(torch.from_numpy(boxes), torch.from_numpy(box)).numpy()
-    return found
+    return np.asarray(overlap(torch.from_numpy(boxes), torch.from_numpy(box)))
 
 
 def frame_of(payload: Any, names: Collection[str]) -> DetectedFrame:
-    """Return what the payload of a detection's row says of boxes with some names."""
     found = [one for one in payload["found"] if one["label"] in names]
     boxes = np.array([one["box"] for one in found], dtype=float).reshape(-1, 4)
-    true = payload["box"]
-    return DetectedFrame(
-        None if true is None else np.array(true, dtype=float), boxes, np.array([one["score"] for one in found])
-    )
+    true = None if payload["box"] is None else np.array(payload["box"], dtype=float)
+    return DetectedFrame(true, boxes, np.array([one["score"] for one in found]))
 
 
 def tracked(frames: Sequence[DetectedFrame], tracker: Tracker, iou: float) -> Tracked:
@@ -108,9 +103,8 @@ def tracked(frames: Sequence[DetectedFrame], tracker: Tracker, iou: float) -> Tr
     for true, boxes, scores in frames:
         tracks = step(boxes, scores)
         places = np.array([box for _, box in tracks], dtype=float).reshape(-1, 4)
-        numbers = [number for number, _ in tracks]
-        each = [] if true is None else list(zip(overlaps(places, true).tolist(), numbers, strict=True))
-        on = [one for one in each if one[0] >= iou]
+        shares = [] if true is None else overlaps(places, true).tolist()
+        on = [(share, number) for share, (number, _) in zip(shares, tracks, strict=False) if share >= iou]
         lost.append(true is not None and not on)
         if on:
             number = last if any(number == last for _, number in on) else max(on)[1]
