@@ -156,9 +156,6 @@ def facts_of(result: Result, given: ShownResult) -> dict[str, str]:
     return {name: text for name, text in {**given.facts, **own, **given.facts}.items() if text}
 
 
-# ---- fields as they are ---------------------------------------------------------------------------------------------
-
-
 def fields_shown(result: Result) -> ShownResult:
     """Return the lists of a result as tables, its other fields as facts, and what their names mean."""
     values = {name: getattr(result, name) for name in type(result).described()}

@@ -140,9 +140,6 @@ def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:
     return policy
 
 
-# ---- what is asked for ----------------------------------------------------------------------------------------------
-
-
 @dataclass
 class AttackParts:
     """Everything that was asked for, found and loaded: the model and what was said of it, a task that is not yet on the

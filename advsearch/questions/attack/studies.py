@@ -166,9 +166,6 @@ def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Pr
             progress.advance(1, **({} if facts is None else {"workers": facts.workers}))
 
 
-# ---- one study ------------------------------------------------------------------------------------------------------
-
-
 class StudyRun:
     """Carries out attacks, each in a folder of its own, unless they are done already; first on workers, if asked to.
 
@@ -215,9 +212,6 @@ class StudyRun:
 
     def result(self, kind: type[Made], **fields: Any) -> Made:
         return self.asked.result(kind, parts=self.names, warnings=self.warnings, **fields)
-
-
-# ---- several objects or epsilons, and several models ----------------------------------------------------------------
 
 
 def curve(asked: Asked[AttackConfig]) -> CurveResult:

@@ -218,9 +218,6 @@ def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, pr
     yield from results.rows(f"{part.key} texels", TexelRow, lambda: resolved_texels(renderer, u, seed=seed))
 
 
-# ---- what leaving something out saves --------------------------------------------------------------------------------
-
-
 ALL, BOUNCES = "everything above", "bounces"
 """Names of the rows in which all items are put back together, and in which paths have their full length."""
 WHAT = {**ITEMS, BOUNCES: "bounces of light beyond the search's longest path", ALL: "all of these"}

@@ -144,9 +144,6 @@ def shown(result: StabilityResult) -> ShownResult:
     )
 
 
-# ---- cases -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Outcome:
     """What a case found: the numbers that decide, and whether every picture and gradient was finite, and none had to be
