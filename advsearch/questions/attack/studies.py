@@ -75,11 +75,6 @@ class StudyAttack:
     of: str
     epsilon: float | None = None
 
-    @property
-    def title(self) -> str:
-        """What it is, in words."""
-        return self.config.object + ("" if self.of == self.config.object else f" with {self.of}")
-
 
 Chain = list[StudyAttack]  # Attacks that follow one another, until one finds something
 
@@ -103,15 +98,11 @@ def chains_of(config: AttackConfig) -> list[Chain]:
     else:
         for place, name in enumerate(different(config.objects, "object")):
             chains.append([])
-            for epsilon in _epsilons(config):
+            for epsilon in sorted(config.epsilons) or [None]:  # None is the own of each control
                 words = [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
                 changed = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
                 chains[-1].append(StudyAttack(changed, f"{place:02d}-" + default_name(name, words), name, epsilon))
     return chains
-
-
-def _epsilons(config: AttackConfig) -> list[float | None]:
-    return [*sorted(config.epsilons)] or [None]
 
 
 def attacks_of(settings: JsonObject) -> Call:
@@ -151,7 +142,8 @@ def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Pr
         progress.stage("attacks on workers", len(left))
         for done in executor.results([number] for number in left):
             if done.lost:
-                title = chains[done.items[0]][0].title
+                (lost, *_) = chains[done.items[0]]
+                title = lost.config.object + ("" if lost.of == lost.config.object else f" with {lost.of}")
                 raise ClusterError(f"{title}: {done.lost}; leave it out, or go on without it")
             for name, before, files_there in done.value:
                 path, part = run / PARTS / name, run / PARTS / f"{PART}{name}"
@@ -200,9 +192,8 @@ class StudyRun:
         budget = f", epsilon {config.epsilon:.3g}" if isinstance(config.epsilon, float) else ""
         what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
         self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
-        summary = carry_out_part(
-            path, config, self.progress, lambda there, **more: attacking.attack_once(there, clean=clean, **more).summary
-        )
+        ask = lambda there, **more: attacking.attack_once(there, clean=clean, **more).summary  # noqa: E731
+        summary = carry_out_part(path, config, self.progress, ask)
         if not isinstance(summary, AttackSummary):
             raise FileFormatError(f"{path}: expected the run of an attack, got one of {summary.command}")
         self.warnings += [text for text in summary.warnings if text not in self.warnings]
@@ -239,7 +230,7 @@ def curve(asked: Asked[AttackConfig]) -> CurveResult:
             if row.ending in SETTLED:
                 break
         rows.append(row)
-    epsilons = _epsilons(asked.config)
+    epsilons: list[float | None] = [*sorted(asked.config.epsilons)] or [None]
     points = [_accuracy(rows, epsilon) for epsilon in epsilons]
     return study.result(CurveResult, epsilons=epsilons, table=rows, curve=points)
 
