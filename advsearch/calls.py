@@ -105,7 +105,6 @@ def check_types(parameters: Mapping[str, inspect.Parameter], given: Mapping[str,
 
 
 def _kinds(annotation: str) -> list[str]:
-    """The types that an annotation names; none where it has names of other things."""
     plain, count = annotation, 1
     while count:
         plain, count = re.subn(r"\[[^][]*\]", "", plain)

@@ -11,9 +11,9 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import JsonValue, field_validator, model_validator
+from pydantic import Field, JsonValue, field_validator, model_validator
 
 from advsearch import registry
 from advsearch.errors import FileFormatError, InputError
@@ -106,10 +106,8 @@ CLOSE_LOOKS = 4  # then a candidate is rendered so many times more, at most, whi
 
 
 class SceneConfig(Config):
-    """What every command over a scene and a model needs to know.
-
-    A file is looked for relative to the current directory. None means "choose for me", and the description says how.
-    """
+    """What every command over a scene and a model needs to know. A file is looked for relative to the current
+    directory. None means "choose for me", and the description says how."""
 
     free: ClassVar[tuple[str, ...]] = (*Config.free, "ask")
     several: ClassVar[tuple[str, ...]] = ()
@@ -221,7 +219,7 @@ class SceneConfig(Config):
         None, "search", "side length of the searched texture", unit="texels", otherwise="chosen from the object's own",
         ge=2, le=4096,
     )
-    spp: int | Literal["auto"] | None = setting(
+    spp: Annotated[int, Field(ge=1, le=65536)] | Literal["auto"] | None = setting(
         None, "search",
         "samples per pixel of a render of the search; auto takes half of the default, and renders the best candidates "
         "again while they are close",
@@ -336,28 +334,25 @@ class SceneConfig(Config):
     @field_validator("prompt", mode="before")
     @classmethod
     def _prompts_as_text(cls, value: Any) -> Any:
-        several = isinstance(value, (list, tuple)) and all(isinstance(text, str) for text in value)
-        text = " | ".join(value) if several else value
-        if isinstance(text, str) and not all(part.strip() for part in text.split("|")):
+        if isinstance(value, (list, tuple)) and all(isinstance(text, str) for text in value):
+            value = " | ".join(value)
+        if isinstance(value, str) and not all(map(str.strip, value.split("|"))):
             raise ValueError("no text")
-        return text
+        return value
 
     @field_validator("task", mode="before")
     @classmethod
     def _task_with_options(cls, value: Any) -> Any:
-        """Accept ``{name: yaw, tolerance: 5}``, ``yaw={tolerance: 5}`` and a name, and several with + between them."""
         return read_joined(value, "task", cls.model_fields["task"].default)
 
     @field_validator("controls", "over", mode="before", check_fields=False)
     @classmethod
     def _controls_from_names(cls, value: Any) -> Any:
-        """Accept ``"texture"`` and ``["texture", "pose={yaw: [0, 90]}"]``, and an empty YAML value."""
+        if isinstance(value, Mapping):
+            return {name: {} if given is None else given for name, given in by_key(value).items()}
         names = [value] if isinstance(value, str) else value
-        if isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names):
-            return read_controls(names, "controls")
-        if isinstance(names, Mapping):
-            return {name: {} if given is None else given for name, given in by_key(names).items()}
-        return value
+        listed = isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names)
+        return read_controls(names, "controls") if listed else value
 
     @field_validator("estimators", mode="before", check_fields=False)
     @classmethod
@@ -367,25 +362,22 @@ class SceneConfig(Config):
     @field_validator("resolution", mode="before")
     @classmethod
     def _resolution_from_text(cls, value: Any) -> Any:
-        """Accept 224, ``"224"`` and ``"224x320"`` (height by width)."""
         parts = value.lower().split("x") if isinstance(value, str) else value
         if isinstance(parts, int):
             parts = [parts]
         return [*parts, *parts] if isinstance(parts, (list, tuple)) and len(parts) == 1 else parts
 
-    @field_validator("spp", "resolution")
+    @field_validator("resolution")
     @classmethod
-    def _in_range(cls, value: Any, info: Any) -> Any:
-        low, most = (1, 65536) if info.field_name == "spp" else (8, 4096)
-        numbers = value if isinstance(value, tuple) else (value,)
-        if any(isinstance(number, int) and not low <= number <= most for number in numbers):
+    def _sides_in_range(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
+        if not all(8 <= side <= 4096 for side in value or ()):
             raise ValueError("out of range")
         return value
 
     @field_validator("set_", mode="before")
     @classmethod
     def _numbers_from_text(cls, value: Any) -> Any:
-        """Read ``1e-3`` as a number: YAML takes it for text."""
+        # YAML takes 1e-3 for text
         return {name: number_or_text(given) for name, given in value.items()} if isinstance(value, Mapping) else value
 
 
@@ -532,9 +524,8 @@ FIRST = ("attack", "render", "sweep")  # the commands that the docs show first
 
 class _Configs(Mapping[str, type[Config]]):
     def __iter__(self) -> Iterator[str]:
-        there = [name for name in FIRST if name in ("render", *registry.rooms())]
-        others = (name for name in registry.rooms() if name not in FIRST)
-        return iter((*there, *(name for name in others if registry.Room(name).config is not None)))
+        names = sorted(["render", *registry.rooms()], key=lambda name: (name not in FIRST, name))
+        return (name for name in names if name == "render" or registry.Room(name).config is not None)
 
     def __len__(self) -> int:
         return sum(1 for _ in self)

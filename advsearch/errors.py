@@ -86,12 +86,10 @@ class ClusterError(AdvsearchError):
 
 
 def resembling(name: str, known: Iterable[str]) -> list[str]:
-    """Return the known names that are like `name`, whatever their case, best first.
-
-    First those with all of its words ("coffee mug" for "mug"; a plural s is no difference), then those with words that
-    begin like them, then those that contain it; of equals, those with fewer other words, and with its last word last.
-    Where there is none, those of nearly the same spelling, as a whole or in one word.
-    """
+    """Return the known names that are like `name`, whatever their case, best first. First those with all of its words
+    ("coffee mug" for "mug"; a plural s is no difference), then those with words that begin like them, then those that
+    contain it; of equals, those with fewer other words, and with its last word last. Where there is none, those of
+    nearly the same spelling, as a whole or in one word."""
     asked, names = _words(name), list(dict.fromkeys(known))
     ranks = {known: rank for known in names if (rank := _rank(asked, _words(known))) is not None}
     if ranks:
@@ -102,7 +100,6 @@ def resembling(name: str, known: Iterable[str]) -> list[str]:
 
 
 def _words(name: str) -> list[str]:
-    """The words of a name in folded case, without a plural s."""
     words = [word for word in re.split(r"[\W_]+", name.casefold()) if word]
     return [re.sub("(?<=ss|sh|ch)es$|(?<=[^s])s$", "", word) if len(word) > 3 else word for word in words]
 

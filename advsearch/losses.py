@@ -121,11 +121,8 @@ nps = non_printability  # its usual short name
 
 
 def check_aim(objective: object, *, targeted: bool) -> None:
-    """Check that one of these losses, or of torch's, leads where a search is to go; any other objective passes.
-
-    Raises:
-        InputError: it needs a target that is not there, or would lead away from the one that is.
-    """
+    """Check that one of these losses, or of torch's, leads where a search is to go; any other objective passes. Raises
+    InputError: it needs a target that is not there, or would lead away from the one that is."""
     function = getattr(objective, "func", objective)  # of functools.partial
     module = str(getattr(function, "__module__", None) or type(function).__module__)
     if targeted and module.startswith(("torch.nn.functional", "torch.nn.modules", "torch._C")):
@@ -145,7 +142,6 @@ def check_aim(objective: object, *, targeted: bool) -> None:
 
 
 def _by_label(loss: Callable[..., Tensor], logits: Tensor, labels: Labels) -> Tensor:
-    """A loss of a label set; row by row where rows have different right labels."""
     if not isinstance(labels, (Tensor, Sequence)):
         raise InputError(
             f"labels: expected (N,) int64 or the indices of a label set, got {type(labels).__name__}, the truth of "

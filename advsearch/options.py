@@ -115,7 +115,6 @@ def _expected(kind: str, value: object) -> str | None:
 
 
 def _as_json(value: object) -> JsonValue:
-    """Return a finite number, a truth value, a text, or lists and mappings of these; None of all else."""
     if isinstance(value, Mapping):
         mapping = {name: _as_json(inner) for name, inner in value.items() if isinstance(name, str)}
         return mapping if len(mapping) == len(value) and None not in mapping.values() else None

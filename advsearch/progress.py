@@ -26,25 +26,19 @@ class Progress(Protocol):
             hint: what it consists of, and in backticks the setting that shortens it: "40 pictures; lower `steps`".
             at_most: `total` is an upper bound: the stage may end before.
         """
+        return
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         """Report `n` more steps of the stage done. `info` is shown beside the bar: ``best=0.31``."""
+        return
 
     def message(self, text: str) -> None:
         """Show one sentence that a person should read: a warning, say."""
+        return
 
 
-class NullProgress:
+class NullProgress(Progress):
     """The watcher that looks away: what a Python call uses when it is given none."""
-
-    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        """See `Progress.stage`."""
-
-    def advance(self, n: int = 1, **info: float | str) -> None:
-        """See `Progress.advance`."""
-
-    def message(self, text: str) -> None:
-        """See `Progress.message`."""
 
 
 Watched = Progress | bool | None
@@ -72,11 +66,12 @@ def watched(asked: Watched, written: Callable[[str], str] = str) -> Iterator[Pro
     """Yield the progress that a call asked for, see `Watched`. `written` writes the settings that a text names as
     whoever reads it does. Raises InputError where something else was asked for."""
     stream = sys.stderr
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     if asked not in (None, True, False):
         if not callable(getattr(asked, "stage", None)):
             raise InputError(f"progress: expected True, False, None or a Progress, got {asked!r:.80}")
         yield asked  # type: ignore[misc]
-    elif asked and in_notebook():
+    elif asked and getattr(shell, "kernel", None) is not None:  # a notebook asks
         with NotebookProgress(written) as shown:
             yield shown
     elif asked is not False and stream is not None and stream.isatty():
@@ -98,12 +93,6 @@ def shows_progress(function: Function) -> Function:
             return function(*args, progress=watcher, **named)
 
     return shown  # type: ignore[return-value]
-
-
-def in_notebook() -> bool:
-    """Whether a notebook asks."""
-    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
-    return getattr(shell, "kernel", None) is not None
 
 
 class LineProgress:
@@ -149,7 +138,7 @@ class LineProgress:
                 self._print(f"{self._name}: {self._far()}")
 
     def _far(self) -> str:
-        """How far it is: ``12 of at most 40, 10 s, at most 25 s left, best 0.31``."""
+        # 12 of at most 40, 10 s, at most 25 s left, best 0.31
         done, total, elapsed = self._done, self._total, self._clock() - self._began
         most = "at most " if self._at_most else ""
         parts = [f"{done} of {most}{total}" if total is not None else f"{done} done" if done else ""]

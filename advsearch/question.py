@@ -85,11 +85,10 @@ class Asked(Generic[Settings]):
 
 
 def carried_out(function: Callable[[Asked[Settings]], AnyResult], asked: Asked[Settings]) -> AnyResult:
-    """Return the result of a function, which is kept in its run with its page and its figure, unless the function has
-    kept it itself."""
+    """Return the result of a function, which is kept in its run with its page and its figure."""
     with asked:
         result = function(asked)
-        if "run" not in vars(asked):
+        if "run" not in vars(asked):  # else the function has kept it itself
             return result
         for suffix, data in result_figure(shown(result)).items():
             write_bytes(asked.run.path / "images" / f"{asked.config.command}.{suffix}", data)
@@ -123,20 +122,24 @@ def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path
 
 @dataclass(frozen=True)
 class Question(Generic[AnyResult]):
-    """A question. Attributes as for `question`; `config` and `result` are the classes of settings and result."""
+    """A question: its function, the classes of its settings and its result, and what else is said of it."""
 
     function: Callable[..., AnyResult]
     config: type[Config]
     result: type[AnyResult]
-    examples: tuple[str, ...]
-    place: tuple[str, ...]
-    about: str
-    expected: tuple[Any, ...] | None
-    brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None
-    called: str
-    more: str
-    short: Callable[[Any], bool]
-    listed: str
+    examples: tuple[str, ...]  # lines of a shell, for its help
+    place: tuple[str, ...] = ()  # settings that Python takes by position
+    about: str = ""  # the setting that names a run or a file which it is about
+    # where that is given without its flag, what stands for it in the help, and what an error says it is; perhaps what
+    # the help adds, and whether there may be several
+    expected: tuple[Any, ...] | None = None
+    # returns settings that the `run.yaml` of that run brings, by what was typed
+    brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None
+    called: str = ""  # ``module:function`` that Python calls, where more can be given there than settings
+    more: str = ""  # what its help says after what it does
+    # whether a result falls short of what was checked, which ends the command with status 3
+    short: Callable[[Any], bool] = lambda result: False
+    listed: str = ""  # ``module:function`` that returns what that setting may be, each with a line: `list` prints it
 
     def from_config(
         self, config: Any, *, progress: Progress | None = None, resumed: Path | None = None, **more: Any
@@ -153,8 +156,7 @@ class Question(Generic[AnyResult]):
     def python(self) -> Callable[..., Any]:
         """What Python calls, with every setting as a keyword."""
         if self.called:
-            module, _, name = self.called.partition(":")
-            made: Callable[..., Any] = getattr(import_module(module), name)
+            made: Callable[..., Any] = registry.imported(self.called)
             return made
         from advsearch.api.keywords import asks, configured  # imports torch
 
@@ -162,17 +164,13 @@ class Question(Generic[AnyResult]):
             given = dict(zip(self.place, args, strict=False))
             return self.from_config(configured(self.config, **given, **settings), progress=watcher(progress))
 
-        fields = self.config.model_fields
-        Parameter = inspect.Parameter
-        parameters = []
+        Parameter, parameters = inspect.Parameter, []
         for name in self.place:
-            default = Parameter.empty if fields[name].is_required() else fields[name].default
-            kind = TYPES.get(name, "str | Path")
+            field, kind = self.config.model_fields[name], TYPES.get(name, "str | Path")
+            default = Parameter.empty if field.is_required() else field.default
             parameters.append(Parameter(name, Parameter.POSITIONAL_OR_KEYWORD, default=default, annotation=kind))
-        parameters += [
-            Parameter("progress", Parameter.KEYWORD_ONLY, default=None, annotation="Watched"),
-            Parameter("settings", Parameter.VAR_KEYWORD),
-        ]
+        parameters.append(Parameter("progress", Parameter.KEYWORD_ONLY, default=None, annotation="Watched"))
+        parameters.append(Parameter("settings", Parameter.VAR_KEYWORD))
         signature = inspect.Signature(parameters, return_annotation=self.result.__name__)
         function.__signature__ = signature  # type: ignore[attr-defined]
         function.__name__, function.__doc__ = self.config.command, self.function.__doc__
@@ -180,39 +178,15 @@ class Question(Generic[AnyResult]):
         return asks(self.config)(function)
 
 
-def question(
-    *examples: str,
-    place: tuple[str, ...] = (),
-    about: str = "",
-    expected: tuple[Any, ...] | None = None,
-    brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None,
-    called: str = "",
-    more: str = "",
-    short: Callable[[Any], bool] = lambda result: False,
-    listed: str = "",
-) -> Callable[[Callable[..., AnyResult]], Question[AnyResult]]:
-    """Make a question of a function ``(asked: Asked[NameConfig]) -> NameResult``, called as its command.
-
-    Args:
-        examples: lines of a shell, for its help.
-        place: settings that Python takes by position.
-        about: the setting that names a run or a file which it is about.
-        expected: where that is given without its flag, what stands for it in the help, and what an error says it is;
-            as further fields of `cli.main.Positional`, what the help adds, and whether there may be several.
-        brought: returns settings that the `run.yaml` of that run brings, by what was typed.
-        called: ``module:function`` that Python calls, where more can be given there than settings.
-        more: what its help says after what it does.
-        short: whether a result falls short of what was checked, which ends the command with status 3.
-        listed: ``module:function`` that returns what that setting may be, with a line about each: `list` prints it.
-    """
+def question(*examples: str, **fields: Any) -> Callable[[Callable[..., AnyResult]], Question[AnyResult]]:
+    """Make a `Question` of a function ``(asked: Asked[NameConfig]) -> NameResult`` that is called as its command, with
+    examples for its help and further fields of `Question` by their names."""
 
     def decorate(function: Callable[..., AnyResult]) -> Question[AnyResult]:
         hints = get_type_hints(function)
         first, result = next(iter(inspect.signature(function).parameters)), hints["return"]
-        result = (*get_args(result), result)[0]  # the first of several kinds
         (config,) = get_args(hints[first])
-        return Question(
-            function, config, result, examples, place, about, expected, brought, called, more, short, listed
-        )
+        result = (*get_args(result), result)[0]  # the first of several kinds
+        return Question(function, config, result, examples, **fields)
 
     return decorate

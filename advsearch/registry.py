@@ -47,12 +47,20 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     imports: bool = False
 
     def __getitem__(self, name: str) -> Entry:
-        if self.names_class(name):
-            return self._class(name)
-        entry: Any = self.own[name] if name in self.own else self._installed[name]
-        if isinstance(entry, str):
-            module, _, attribute = entry.partition(":")
-            entry = getattr(import_module(module), attribute)
+        """Return an entry. Raises InputError where the class that a name is cannot be imported, is something else, or
+        must not be imported (`check_import`)."""
+        if not self.names_class(name):
+            entry: Any = self.own[name] if name in self.own else self._installed[name]
+            return imported(entry) if isinstance(entry, str) else entry
+        check_import(name)
+        try:
+            with current_directory_importable():
+                entry = imported(name)
+        except Exception as error:  # the user's code may raise anything
+            mend = f"a module is looked for on the Python path and in {os.getcwd()}"
+            raise InputError(f"{name}: cannot be imported ({type(error).__name__}: {error}); {mend}") from error
+        if not self.fits(getattr(entry, "kind", ""), entry):
+            raise InputError(f"{name}: expected {self.expected}, got {entry!r}")
         return entry  # type: ignore[no-any-return]
 
     def __iter__(self) -> Iterator[str]:
@@ -69,25 +77,8 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         parts = module.split(".")
         return all(part.isidentifier() for part in parts) and not (parts[0] in self.own or parts[0] in self._installed)
 
-    def _class(self, name: str) -> Entry:
-        """Import "package.module:Class". Raises InputError where it cannot be imported, is something else, or must not
-        be imported (`check_import`)."""
-        module, _, attribute = name.partition(":")
-        check_import(name)
-        try:
-            with current_directory_importable():
-                entry: Entry = getattr(import_module(module), attribute)
-        except Exception as error:  # the user's code may raise anything
-            mend = f"a module is looked for on the Python path and in {os.getcwd()}"
-            raise InputError(f"{name}: cannot be imported ({type(error).__name__}: {error}); {mend}") from error
-        if not self.fits(getattr(entry, "kind", ""), entry):
-            raise InputError(f"{name}: expected {self.expected}, got {entry!r}")
-        return entry
-
     @cached_property
     def _installed(self) -> dict[str, Entry]:
-        """Entries of other packages. Raises InputError where what an entry point names cannot be imported, or is
-        something else."""
         entries: dict[str, Entry] = {}
         for point in entry_points(group=self.group):
             where = f"entry point {point.name} = {point.value} of group {self.group}"
@@ -100,6 +91,12 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
                 raise InputError(f"{where}: expected {self.expected}; {mend}")
             entries[point.name] = entry
         return entries
+
+
+def imported(place: str) -> Any:
+    """Return what "module:attribute" names."""
+    module, _, attribute = place.partition(":")
+    return getattr(import_module(module), attribute)
 
 
 _ALLOWED: set[str] = set()
@@ -234,7 +231,6 @@ FOLDER = Path(__file__).parent / "questions"
 
 @cache
 def _texts() -> dict[str, str]:
-    """The first file of each question, by its name: what is asked of all of them imports none."""
     files = {path.stem: path for path in FOLDER.glob("*.py") if path.stem != "__init__"}
     files |= {path.parent.name: path for path in FOLDER.glob("*/__init__.py")}
     return {name: files[name].read_text(encoding="utf-8") for name in sorted(files)}

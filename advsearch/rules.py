@@ -97,10 +97,8 @@ def halves(table: pd.DataFrame, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 @dataclass(frozen=True)
 class RuleCondition:
-    """A part of the values of one factor: over `low` and at most `high`, or some of its names.
-
-    With a `turn`, 360 or 180 degrees, values repeat after it, and where `low` is over `high` the part goes through 0.
-    """
+    """A part of the values of one factor: over `low` and at most `high`, or some of its names. With a `turn`, 360 or
+    180 degrees, values repeat after it, and where `low` is over `high` the part goes through 0."""
 
     factor: str
     unit: str = ""
@@ -195,7 +193,6 @@ class CountedRule:
         return None
 
     def _chance(self, times: float) -> float:
-        """That of so many times as many units."""
         units, right = (np.concatenate([self.inside[name], self.elsewhere[name]]) for name in ("unit", "correct"))
         under = np.arange(len(units)) < len(self.inside)
         k, a, r, b = (per_unit(one, units) for one in (under & right, under, ~under & right, ~under))
@@ -293,7 +290,6 @@ class TreeColumn(NamedTuple):
 
 
 def _candidates(table: pd.DataFrame, least: int, seed: int) -> Iterator[RuleConditions]:
-    """The nodes of one tree of all rows and of a random forest."""
     trees_of, forests = (import_library(f"sklearn.{part}") for part in ("tree", "ensemble"))
     one_tree, forest = trees_of.DecisionTreeClassifier, forests.RandomForestClassifier
     columns: list[npt.NDArray[np.float64]] = []
@@ -332,7 +328,6 @@ def _candidates(table: pd.DataFrame, least: int, seed: int) -> Iterator[RuleCond
 
 
 def _nodes(tree: Any, splits: list[TreeColumn]) -> Iterator[dict[TreeColumn, RuleCondition]]:
-    """What holds at each node of a tree, by what its columns are of."""
     open_nodes: list[tuple[int, dict[TreeColumn, RuleCondition]]] = [(0, {})]
     while open_nodes:
         node, conditions = open_nodes.pop()

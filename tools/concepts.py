@@ -23,6 +23,9 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
 UNTYPED = re.compile(r"(?:dict|Mapping)\[str, Any\]")
 Modules = Mapping[str, Path]
 
@@ -77,34 +80,16 @@ def inner_imports(text: str) -> dict[int, str]:
 
 
 def circles(modules: Modules) -> list[list[str]]:
-    """Return the groups of modules that import each other in a circle (Tarjan 1972)."""
-    graph = {name: sorted(set(imports_of(name, path, modules)) - {name}) for name, path in modules.items()}
-    index: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    found: list[list[str]] = []
-
-    def visit(name: str) -> None:
-        index[name] = low[name] = len(index)
-        stack.append(name)
-        for other in graph[name]:
-            if other not in index:
-                visit(other)
-                low[name] = min(low[name], low[other])
-            elif other in stack:
-                low[name] = min(low[name], index[other])
-        if low[name] == index[name]:
-            place = stack.index(name)
-            group = stack[place:]
-            del stack[place:]
-            if len(group) > 1:
-                found.append(sorted(group))
-
-    sys.setrecursionlimit(10_000)
-    for name in graph:
-        if name not in index:
-            visit(name)
-    return found
+    """Return the groups of modules that import each other in a circle."""
+    places = {name: place for place, name in enumerate(modules)}
+    imports = np.zeros((len(modules), len(modules)), dtype=bool)
+    for name, path in modules.items():
+        imports[places[name], [places[other] for other in imports_of(name, path, modules)]] = True
+    _, groups = connected_components(imports, connection="strong")
+    members = defaultdict[int, list[str]](list)
+    for name, group in zip(modules, groups.tolist(), strict=True):
+        members[group].append(name)
+    return [sorted(names) for names in members.values() if len(names) > 1]
 
 
 def takes_settings(tree: ast.Module) -> bool:

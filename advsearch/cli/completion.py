@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from advsearch.cli import output
-from advsearch.cli.main import COMMANDS, PlainCommand, add_command, argument, without_commands
+from advsearch.cli.main import COMMANDS, add_command, argument, command, without_commands
 from advsearch.cli.show import REGISTRIES, list_names
 from advsearch.errors import InputError
 
@@ -25,48 +25,41 @@ NAMED = {
 OR_A_FILE = ("--object", "--environment", "--model")
 
 
-def _completion(args: argparse.Namespace) -> int:
-    try:
-        import shtab  # an optional extra
-    except ImportError as error:
-        raise InputError("completion needs the package shtab; install it with: pip install shtab") from error
-    parser, commands = without_commands()
-    names = {kind: sorted(list_names(kind)) for kind in NAMED.values() if kind in REGISTRIES}
-    for command in COMMANDS:
-        for action in add_command(commands, command)._actions:
-            flag = action.option_strings[-1] if action.option_strings else ""
-            named = names.get(NAMED.get(flag, ""))
-            if action.nargs == 0 or action.choices is not None:
-                continue
-            if named and flag not in OR_A_FILE:
-                action.choices = named
-            else:  # where shtab looks for it
-                action.complete = _names_or_files(flag, named) if named else shtab.FILE  # type: ignore[attr-defined]
-    script = shtab.complete(parser, shell=args.shell)
-    return output.say(args.json, {"command": "completion", "shell": args.shell, "script": script}, script)
-
-
-def _names_or_files(flag: str, names: list[str]) -> dict[str, Any]:
-    """Return how each shell finishes a flag that takes a name or a file, in shtab's form."""
-    function = f"_advsearch{flag.replace('-', '_')}"
-    words = " ".join(names)
-    return {
-        "preamble": {"bash": f'{function}() {{ compgen -W "{words}" -- "$1"; compgen -f -- "$1"; }}'},
-        "bash": function,
-        "zsh": f"_alternative 'names:name:({words})' 'files:file:_files'",
-        "tcsh": "f",
-    }
-
-
-COMPLETION = PlainCommand(
-    _completion,
-    (
-        argument("shell", choices=["bash", "zsh", "tcsh"], help="the shell that the script is for"),
-        output.add_flags,
-    ),
+@command(
+    argument("shell", choices=["bash", "zsh", "tcsh"], help="the shell that the script is for"),
+    output.add_flags,
     more=". It needs the package shtab (pip install shtab)",
     examples=(
         "completion bash > ~/.local/share/bash-completion/completions/advsearch",
         "completion zsh > ~/.zfunc/_advsearch",
     ),
 )
+def completion(args: argparse.Namespace) -> int:
+    """Print the script."""
+    try:
+        import shtab  # an optional extra
+    except ImportError as error:
+        raise InputError("completion needs the package shtab; install it with: pip install shtab") from error
+    parser, commands = without_commands()
+    names = {kind: sorted(list_names(kind)) for kind in NAMED.values() if kind in REGISTRIES}
+    for name in COMMANDS:
+        for action in add_command(commands, name)._actions:
+            flag = action.option_strings[-1] if action.option_strings else ""
+            named = names.get(NAMED.get(flag, ""))
+            if action.nargs == 0 or action.choices is not None:
+                continue
+            if named and flag not in OR_A_FILE:
+                action.choices = named
+                continue
+            ways: dict[str, Any] = shtab.FILE
+            if named:  # or a file
+                function, words = f"_advsearch{flag.replace('-', '_')}", " ".join(named)
+                ways = {
+                    "preamble": {"bash": f'{function}() {{ compgen -W "{words}" -- "$1"; compgen -f -- "$1"; }}'},
+                    "bash": function,
+                    "zsh": f"_alternative 'names:name:({words})' 'files:file:_files'",
+                    "tcsh": "f",
+                }
+            action.complete = ways  # type: ignore[attr-defined]  # where shtab looks for it
+    script = shtab.complete(parser, shell=args.shell)
+    return output.say(args.json, {"command": "completion", "shell": args.shell, "script": script}, script)

@@ -1,7 +1,4 @@
-"""`advsearch dashboard`: look at runs in a browser; `advsearch view`: make the page of a run anew.
-
-Or a folder with it that any web server can serve.
-"""
+"""`advsearch dashboard`: look at runs in a browser; `advsearch view`: make the page of a run anew."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.main import PlainCommand, argument
+from advsearch.cli.main import argument, command
 from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
 from advsearch.runs.directory import find_run
@@ -32,7 +29,25 @@ SEEN = (
 )
 
 
-def _dashboard(args: argparse.Namespace) -> int:
+@command(
+    argument("runs", nargs="*", metavar="RUN", help="names or folders of runs (default: all in runs/)"),
+    argument(
+        "--host",
+        default="127.0.0.1",
+        help="address to listen at (default: %(default)s); at others, whoever has the printed "
+        "token sees the runs and can add photographs, which the run's model judges here",
+    ),
+    argument("--port", type=int, default=PORT, help="port; 0 takes a free one (default: %(default)s)"),
+    argument(
+        "--https", action="store_true", help="speak HTTPS on this machine too; at other addresses that is always so"
+    ),
+    argument("--json", action="store_true", help="print the address as JSON"),
+    output.add_code_flag,
+    more=". It keeps the photographs that are taken on a run's page, writes nothing else, and ends with Ctrl-C",
+    examples=("dashboard", "dashboard mug-sweep-001 mug-sweep-002", "dashboard --host 0.0.0.0"),
+)
+def dashboard(args: argparse.Namespace) -> int:
+    """Serve pages of runs."""
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
     runs = [find_run(name, checked=False) for name in args.runs]  # the list says what is wrong with one
@@ -73,42 +88,16 @@ class _LoadedLater:
         return self._loaded.agreement(run)
 
 
-DASHBOARD = PlainCommand(
-    _dashboard,
-    (
-        argument("runs", nargs="*", metavar="RUN", help="names or folders of runs (default: all in runs/)"),
-        argument(
-            "--host",
-            default="127.0.0.1",
-            help="address to listen at (default: %(default)s); at others, whoever has the printed "
-            "token sees the runs and can add photographs, which the run's model judges here",
-        ),
-        argument("--port", type=int, default=PORT, help="port; 0 takes a free one (default: %(default)s)"),
-        argument(
-            "--https", action="store_true", help="speak HTTPS on this machine too; at other addresses that is always so"
-        ),
-        argument("--json", action="store_true", help="print the address as JSON"),
-        output.add_code_flag,
-    ),
-    ". It keeps the photographs that are taken on a run's page, writes nothing else, and ends with Ctrl-C",
-    ("dashboard", "dashboard mug-sweep-001 mug-sweep-002", "dashboard --host 0.0.0.0"),
+@command(
+    argument("runs", nargs="+", metavar="RUN", help="a run's name or folder; several sweeps with --bundle"),
+    argument("--bundle", metavar="DIR", help="write a folder: a page, the rows and the small pictures"),
+    output.add_flags,
+    examples=("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site"),
 )
-
-
-def _view(args: argparse.Namespace) -> int:
+def view(args: argparse.Namespace) -> int:
+    """Make the page of a run anew, or a folder with it that any web server can serve."""
     folders = [find_run(name) for name in args.runs]
     if args.bundle is None and len(folders) > 1:
         raise InputError("--bundle: pages of several runs go into a folder; name one, or give one run")
     out = write_page(folders[0]) if args.bundle is None else write_bundle(folders, Path(args.bundle))
     return output.say(args.json, {"command": "view", "runs": list(map(str, folders)), "out": str(out)}, str(out))
-
-
-VIEW = PlainCommand(
-    _view,
-    (
-        argument("runs", nargs="+", metavar="RUN", help="a run's name or folder; several sweeps with --bundle"),
-        argument("--bundle", metavar="DIR", help="write a folder: a page, the rows and the small pictures"),
-        output.add_flags,
-    ),
-    examples=("view mug-sweep-001", "view mug-sweep-001 mug-sweep-002 --bundle site"),
-)

@@ -24,13 +24,14 @@ from pathlib import Path
 
 from advsearch import __version__, threads
 from advsearch.cli import output
-from advsearch.cli.main import PlainCommand
+from advsearch.cli.main import command
 from advsearch.errors import AdvsearchError
 from advsearch.registry import OWN_FOLDER
 from advsearch.scene.mitsuba_backend import llvm
 
 OK, WARNING, MISSING, BROKEN = "ok", "warning", "missing", "broken"
 """The states of a part. A warning does not keep anything from running."""
+COLOURS = {OK: "green", WARNING: "yellow", MISSING: "red", BROKEN: "red"}
 
 GIB = 2**30
 DISK_WANTED, MEMORY_WANTED = 1 * GIB, 3 * GIB
@@ -57,14 +58,31 @@ class Component:
     fix: str = ""
 
 
-def _doctor(args: argparse.Namespace) -> int:
+@command(output.add_flags)
+def doctor(args: argparse.Namespace) -> int:
+    """Say what works."""
     print("advsearch: trying every part, a first render among them; that takes some seconds", file=sys.stderr)
     parts = diagnose()
     good = all(part.status in (OK, WARNING) for part in parts)
     if args.json:
         output.print_json({"schema": 1, "command": "doctor", "ok": good, "parts": [asdict(part) for part in parts]})
-    else:
-        _print_table(parts, good)
+        return 0 if good else output.FELL_SHORT
+    # late: what is missing is told without it, too
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console, table = Console(highlight=False), Table(box=None, pad_edge=False)
+    for heading in ("part", "version", "", "detail"):
+        table.add_column(heading, overflow="fold")
+    for part in parts:
+        state = f"[{COLOURS[part.status]}]{part.status}[/]"
+        table.add_row(escape(part.name), escape(part.version), state, escape(part.detail))
+    console.print(table)
+    console.print()
+    for part in (part for part in parts if part.fix):
+        console.print(f"{escape(part.name)}: {escape(part.fix)}", soft_wrap=True)
+    console.print("Everything that is necessary works." if good else "[red]Something necessary does not work.[/]")
     return 0 if good else output.FELL_SHORT
 
 
@@ -91,20 +109,22 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=SECONDS_ALLOWED, check=False, cwd=OWN_FOLDER
         )
-        output, errors, status = done.stdout, done.stderr, done.returncode
+        printed, status = done.stdout, done.returncode
+        telling = [line.strip() for line in done.stderr.splitlines() if "ERROR" in line or "Error" in line]
+        how = f"signal {signal.Signals(-status).name}" if status < 0 else f"status {status}"
+        ending = f"the trial ended with {how}" + (f" ({telling[0][:120]})" if telling else "") if status else ""
     except subprocess.TimeoutExpired as expired:
         partial = expired.stdout
-        output = partial.decode("utf-8", "replace") if isinstance(partial, bytes) else partial or ""
-        errors, status = "", None
+        printed = partial.decode("utf-8", "replace") if isinstance(partial, bytes) else partial or ""
+        status, ending = None, f"the trial took longer than {SECONDS_ALLOWED} s"
     tried = {}
-    for line in output.splitlines():
+    for line in printed.splitlines():
         try:
             outcome = json.loads(line)
             tried[outcome["name"]] = (bool(outcome["ok"]), str(outcome["detail"]))
         except (ValueError, KeyError, TypeError):  # a library's own words
             continue
-    tried[""] = (status == 0, _ending(status, errors))
-    return tried
+    return {**tried, "": (status == 0, ending)}
 
 
 def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
@@ -121,9 +141,8 @@ def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
         elif tried[name][0]:
             yield Component(name, version, OK, tried[name][1])
         else:
-            mend = (
-                "see libLLVM below, then mend mitsuba and drjit: make setup" if name == "render" else _reinstall(name)
-            )
+            mend = "see libLLVM below, then mend mitsuba and drjit: make setup"
+            mend = mend if name == "render" else _reinstall(name)
             yield Component(name, version, WARNING if name in OPTIONAL else BROKEN, tried[name][1], mend)
 
 
@@ -227,37 +246,3 @@ def check_hardware() -> Component:
     if memory and memory < MEMORY_WANTED:
         return Component("machine", "", WARNING, detail, "a search peaks at 2.5 GiB: close other programs")
     return Component("machine", "", OK, detail)
-
-
-def _ending(status: int | None, errors: str) -> str:
-    if status is None:
-        return f"the trial took longer than {SECONDS_ALLOWED} s"
-    if status == 0:
-        return ""
-    how = f"signal {signal.Signals(-status).name}" if status < 0 else f"status {status}"
-    telling = [line.strip() for line in errors.splitlines() if "ERROR" in line or "Error" in line]
-    return f"the trial ended with {how}" + (f" ({telling[0][:120]})" if telling else "")
-
-
-def _print_table(parts: list[Component], good: bool) -> None:
-    # late: what is missing is told without it, too
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    colours = {OK: "green", WARNING: "yellow", MISSING: "red", BROKEN: "red"}
-    table = Table(box=None, pad_edge=False)
-    for heading in ("part", "version", "", "detail"):
-        table.add_column(heading, overflow="fold")
-    for part in parts:
-        state = f"[{colours[part.status]}]{part.status}[/]"
-        table.add_row(escape(part.name), escape(part.version), state, escape(part.detail))
-    console = Console(highlight=False)
-    console.print(table)
-    console.print()
-    for part in (part for part in parts if part.fix):
-        console.print(f"{escape(part.name)}: {escape(part.fix)}", soft_wrap=True)
-    console.print("Everything that is necessary works." if good else "[red]Something necessary does not work.[/]")
-
-
-DOCTOR = PlainCommand(_doctor, (output.add_flags,))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from advsearch.cli import output
-from advsearch.cli.main import PlainCommand, argument
+from advsearch.cli.main import argument, command
 from advsearch.cli.output import at_work, output_errors
 from advsearch.described import rounded
 from advsearch.errors import InputError, UnknownNameError
@@ -26,21 +26,13 @@ Written = tuple[dict[str, object], str]  # what to tell of a file, as JSON and i
 
 
 class Writer(NamedTuple):
-    """What a run is exported as besides a table of its rows.
+    """What a run is exported as besides a table of its rows."""
 
-    Attributes:
-        text: what comes out, in a sentence.
-        writes: what the name after `--out` is of: "a PDF file".
-        example: a command line without `advsearch` in front.
-        write: writes the run that the words of the command line name.
-        ending: of files that are of this format if no other is asked for: "pdf"; "" for none.
-    """
-
-    text: str
-    writes: str
-    example: str
-    write: Callable[[argparse.Namespace, Path], Written]
-    ending: str = ""
+    text: str  # what comes out, in a sentence
+    writes: str  # what the name after `--out` is of: "a PDF file"
+    example: str  # a command line without `advsearch` in front
+    write: Callable[[argparse.Namespace, Path], Written]  # writes the run that the words of the command line name
+    ending: str = ""  # of files that are of this format if no other is asked for: "pdf"; "" for none
 
 
 def _dataset(args: argparse.Namespace, out: Path, format: str) -> Written:
@@ -135,13 +127,39 @@ WRITERS = {
 """What is no table, by the word of `--format`."""
 
 
-def _add_format(parser: argparse.ArgumentParser) -> None:
-    known = "; ".join(f"{format}: {writer.text[0].lower()}{writer.text[1:-1]}" for format, writer in WRITERS.items())
-    text = f"csv, json or parquet: the rows as a table; {known} (default: by the name of --out, or csv)"
-    parser.add_argument("--format", help=text.replace("%", "%%"))
+_KNOWN = "; ".join(f"{format}: {writer.text[0].lower()}{writer.text[1:-1]}" for format, writer in WRITERS.items())
+FORMAT = f"csv, json or parquet: the rows as a table; {_KNOWN} (default: by the name of --out, or csv)"
 
 
-def _export(args: argparse.Namespace) -> int:
+@command(
+    argument("run", metavar="RUN", help="a run's name or folder"),
+    argument("--format", help=FORMAT.replace("%", "%%")),
+    argument("--out", metavar="FILE", help="the file to write (default: standard output)"),
+    argument("--json", action="store_true", help="the same as --format json; with --out, tell what was written"),
+    argument("--kind", help="only rows of this kind: search, baseline, sweep, ... (default: all)"),
+    argument(
+        "--size", metavar="MM", type=float,
+        help="print: the real object's longest side in millimetres (default: its own where that is known, or "
+        f"{USUAL_SIZE:g})",
+    ),
+    argument(
+        "--sheets", metavar="N", type=int, help="print: sheets that may be written; more are refused (default: 200)"
+    ),
+    argument("--paper", help="print: a4, a3 or letter (default: a4)"),
+    argument(
+        "--all", action="store_true", default=None,
+        help="coco, yolo: right predictions too (default: pictures that a model is wrong about)",
+    ),
+    output.add_code_flag,
+    argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)"),
+    examples=(
+        "export mug-texture-001",
+        "export runs/mug-texture-001 --kind search --out search.parquet",
+        *(writer.example for writer in WRITERS.values()),
+    ),
+)  # fmt: skip
+def export(args: argparse.Namespace) -> int:
+    """Export a run."""
     out = None if args.out is None else Path(args.out)
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     endings = {writer.ending or format: format for format, writer in WRITERS.items()}
@@ -185,35 +203,3 @@ def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
     text = f"{count} rows in {out}" + ("" if by_name == format else f", as {format}")
     facts = {"command": "export", "rows": count, "format": format, "out": str(out)}
     return output.say(args.json, facts, text, sys.stderr)
-
-
-EXPORT = PlainCommand(
-    _export,
-    (
-        argument("run", metavar="RUN", help="a run's name or folder"),
-        _add_format,
-        argument("--out", metavar="FILE", help="the file to write (default: standard output)"),
-        argument("--json", action="store_true", help="the same as --format json; with --out, tell what was written"),
-        argument("--kind", help="only rows of this kind: search, baseline, sweep, ... (default: all)"),
-        argument(
-            "--size", metavar="MM", type=float,
-            help="print: the real object's longest side in millimetres (default: its own where that is known, or "
-            f"{USUAL_SIZE:g})",
-        ),
-        argument(
-            "--sheets", metavar="N", type=int, help="print: sheets that may be written; more are refused (default: 200)"
-        ),
-        argument("--paper", help="print: a4, a3 or letter (default: a4)"),
-        argument(
-            "--all", action="store_true", default=None,
-            help="coco, yolo: right predictions too (default: pictures that a model is wrong about)",
-        ),
-        output.add_code_flag,
-        argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)"),
-    ),
-    examples=(
-        "export mug-texture-001",
-        "export runs/mug-texture-001 --kind search --out search.parquet",
-        *(writer.example for writer in WRITERS.values()),
-    ),
-)  # fmt: skip

@@ -54,9 +54,8 @@ def add_settings(
         add = partial(headings[setting.group].add_argument, default=argparse.SUPPRESS)
         if setting.field == "object":
             add("--scene", metavar="FILE", help=SCENE)
-        if setting.form == "switch":
-            options: dict[str, Any] = {"action": "store_const", "const": not setting.default}
-        else:
+        options: dict[str, Any] = {"action": "store_const", "const": not setting.default}
+        if setting.form != "switch":
             options = {"action": "store" if setting.form == "text" else "append", "metavar": setting.metavar}
         add(setting.flag, dest=setting.field, help=help_text(setting), **options)
         for old in (old for old, new in config.formerly.items() if new == setting.field):
@@ -86,8 +85,8 @@ def command_in(file: str | Path) -> str:
 
 
 def config_of_file(command: str, file: str | Path, changes: Mapping[str, object]) -> Config:
-    """Return the configuration that a file describes; with `changes` put over it. Raises
-    UnknownNameError where there is no such command."""
+    """Return the configuration that a file describes, `changes` put over it. Raises UnknownNameError where there is no
+    such command."""
     if command not in IN_A_FILE:
         raise UnknownNameError("command", command, IN_A_FILE, f"It stands in {file}.")
     return CONFIGS[command].from_yaml(file, changes)
@@ -135,22 +134,20 @@ def help_text(setting: Setting) -> str:
 
 
 def _assignments(given: Sequence[str], flag: str) -> dict[str, object]:
-    """Return name to value from ``NAME=VALUE``, each name once."""
     pairs = [parse_assignment(text, flag) for text in given]
     check_once((name for name, _ in pairs), flag)
     return dict(pairs)
 
 
 def _choices(given: Sequence[str], flag: str) -> dict[str, object]:
-    """Return name to choice from ``NAME=CHOICE`` or a choice for all."""
     return _assignments([text if "=" in text else f"*={text}" for text in given], flag)
 
 
 def _axes(given: Sequence[str], flag: str) -> dict[str, object]:
-    """Return parameter to values from ``PARAMETER=VALUES``, which YAML would take for numbers to the base of 60."""
     names = [text.partition("=")[0].strip() for text in given]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"{flag} {twice[0]}: given twice; write all values in one, separated by commas")
+    # YAML would take some for numbers to the base of 60
     quoted = [re.sub(r"=\s*([^\s\"'\[{].*)", lambda match: f'="{match[1]}"', text, count=1) for text in given]
     return _assignments(quoted, flag)
 

@@ -8,21 +8,28 @@ from typing import TYPE_CHECKING, Any
 
 import advsearch
 from advsearch.cli import output
-from advsearch.cli.main import PlainCommand, argument
+from advsearch.cli.main import argument, command
 from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 from advsearch.runs.summary import read_result
 
 if TYPE_CHECKING:
-    from advsearch.scene.assets import ObjectAsset
     from advsearch.scene.importing.scenes import Contents
 
 VIEWS, SIDE = 4, 192  # views of the picture, and the side of each in pixels
 Understood = tuple[dict[str, Any], list[str]]  # what is understood of a file, as JSON and in lines
 
 
-def _import(args: argparse.Namespace) -> int:
+@command(
+    argument("file", metavar="FILE", help=f"a {either(MESHES)} file, or an .xml file of Mitsuba"),
+    argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)"),
+    output.add_flags,
+    more=". Nothing is written but the picture",
+    examples=("import mug.obj", "import room.glb --json", "import room.glb --out room.png", "import box.xml --json"),
+)
+def file(args: argparse.Namespace) -> int:
+    """Say what is understood of a file."""
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
@@ -45,10 +52,16 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
     materials = {name: len(faces) for name, faces in whole.mesh.materials.items()}
     width, height = whole.base_color.shape[1::-1]
     up = None if whole.up is None else whole.up.axis
-    joints = [] if rig is None else [name.removesuffix(".x") for name in rig.defaults if name.endswith(".x")]
-    targets = [] if rig is None else [name.removesuffix(".weight") for name in rig.defaults if name.endswith(".weight")]
-    moves = {"clips": [] if rig is None else list(rig.clips), "joints": joints, "targets": targets}
-    slow = _slow(whole)
+    clips, moved = ([], []) if rig is None else (list(rig.clips), list(rig.defaults))
+    joints = [name.removesuffix(".x") for name in moved if name.endswith(".x")]
+    targets = [name.removesuffix(".weight") for name in moved if name.endswith(".weight")]
+    features = {"what it lets light through": whole.opacity, "its normal map": whole.normal_map}
+    features["its emission"] = whole.emission
+    held = [name for name, feature in features.items() if feature is not None]
+    slow = held and [
+        f"slow: for {either(held, 'and')}, controls that move outlines (pose, camera, geometry) are differentiated by "
+        "differences, which takes several renders a step; textures and light are not slower"
+    ]
     facts = {
         "triangles": len(whole.mesh.faces),
         "texture": [width, height],
@@ -57,7 +70,7 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
         "nodes": [{"name": n.name, "mesh": n.mesh, "triangles": n.triangles, "size": list(n.size)} for n in nodes],
         "lights": list(inside.lights),
         "cameras": list(inside.cameras),
-        **moves,
+        **{"clips": clips, "joints": joints, "targets": targets},
         "slow": slow,
         "warnings": list(whole.warnings),
     }
@@ -73,7 +86,7 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
         "materials (--control 'texture={materials: [NAME]}')": materials,
         "lights": inside.lights,
         "cameras (--camera NAME)": inside.cameras,
-        "clips (--control 'body={clip: NAME, time: [0, 1]}')": moves["clips"],
+        "clips (--control 'body={clip: NAME, time: [0, 1]}')": clips,
         "joints (--control 'body={NAME.x: [-30, 30]}')": joints,
         "morph targets (--control 'body={NAME.weight: [0, 1]}')": targets,
     }
@@ -81,18 +94,7 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
     return facts, lines + [f"Note: {note}" for note in (*whole.warnings, *slow)]
 
 
-def _slow(whole: ObjectAsset) -> list[str]:
-    features = {"what it lets light through": whole.opacity, "its normal map": whole.normal_map}
-    features["its emission"] = whole.emission
-    slow = [name for name, feature in features.items() if feature is not None]
-    return slow and [
-        f"slow: for {either(slow, 'and')}, controls that move outlines (pose, camera, geometry) are differentiated by "
-        "differences, which takes several renders a step; textures and light are not slower"
-    ]
-
-
 def _mitsuba_file(file: str, out: Path | None) -> Understood:
-    """Read and picture, as its first camera sees it, a Mitsuba scene."""
     from advsearch.scene.mitsuba_backend.scene_files import contents  # late: another thing has this name here
 
     inside = contents(Path(file))
@@ -116,19 +118,21 @@ def _mitsuba_file(file: str, out: Path | None) -> Understood:
     return {**listed, "kept": kept, "warnings": list(warnings)}, lines
 
 
-IMPORT = PlainCommand(
-    _import,
-    (
-        argument("file", metavar="FILE", help=f"a {either(MESHES)} file, or an .xml file of Mitsuba"),
-        argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)"),
-        output.add_flags,
-    ),
-    ". Nothing is written but the picture",
-    ("import mug.obj", "import room.glb --json", "import room.glb --out room.png", "import box.xml --json"),
+def _describe(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Read details.log, class_maps.json and images/ of 3DB into a run: rows, small pictures, a page."
+    )
+
+
+@command(
+    _describe,
+    argument("folder", metavar="FOLDER", help="what 3DB wrote"),
+    argument("--run", help="name or folder of the run (default: runs/FOLDER-3db-NNN)"),
+    argument("--overwrite", action="store_true", help="replace the run that is there"),
+    output.add_flags,
 )
-
-
-def _import_threedb(args: argparse.Namespace) -> int:
+def threedb(args: argparse.Namespace) -> int:
+    """Make a run of what 3DB wrote."""
     from advsearch.questions.sweep.result import import_threedb  # takes seconds
 
     path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)
@@ -137,21 +141,3 @@ def _import_threedb(args: argparse.Namespace) -> int:
     else:
         print(f"{path}: {read_result(path).brief}; {path / 'report.html'} shows it")
     return 0
-
-
-def _describe(parser: argparse.ArgumentParser) -> None:
-    parser.description = (
-        "Read details.log, class_maps.json and images/ of 3DB into a run: rows, small pictures, a page."
-    )
-
-
-IMPORT_3DB = PlainCommand(
-    _import_threedb,
-    (
-        _describe,
-        argument("folder", metavar="FOLDER", help="what 3DB wrote"),
-        argument("--run", help="name or folder of the run (default: runs/FOLDER-3db-NNN)"),
-        argument("--overwrite", action="store_true", help="replace the run that is there"),
-        output.add_flags,
-    ),
-)

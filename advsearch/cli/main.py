@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 #
 # A question's command is made of it (`advsearch.question.question`), or a module with `HELP` (one line) and a
 # `QuestionCommand` or `PlainCommand` called `COMMAND`. It imports what is heavy inside functions, so that `advsearch
-# --help` answers at once. Other commands are a `PlainCommand` in this package, which is imported when it is asked for.
+# --help` answers at once. Others are functions of this package made a `command`, imported when they are asked for.
 
 Argument = Callable[[argparse.ArgumentParser], object]  # adds something to a parser
 
@@ -66,15 +66,11 @@ class PlainCommand:
             add(parser)
 
 
-@dataclass(frozen=True)
-class Positional:
-    """How a setting is given without its flag: what the help calls it and says of it, what is missing where neither is
-    given, and whether there may be several."""
-
-    metavar: str
-    expected: str
-    more: str = ""
-    several: bool = False
+def command(
+    *arguments: Argument, more: str = "", examples: tuple[str, ...] = ()
+) -> Callable[[Callable[[argparse.Namespace], int]], PlainCommand]:
+    """Make a `PlainCommand` of a function; its module and name stand in `GROUPS`."""
+    return lambda run: PlainCommand(run, arguments, more, examples)
 
 
 @dataclass(frozen=True)
@@ -84,24 +80,26 @@ class QuestionCommand:
     Attributes:
         name: of the command; `advsearch.config.CONFIGS` has its settings, and `question.carry_out` asks with them.
         text: makes a text for a person of its result; what is shown of it where it has no other.
-        short: whether a result falls short of what was checked.
-        about: the setting that names runs, or a file, which the question is about; `--code` allows Python code that
-            these name.
-        place: how that setting is given without its flag.
-        brought: returns the settings that the `run.yaml` of the run that it is about brings, by what was typed.
-        listed: where the function is that returns what it may be about, with a line about each, which `list` prints.
-        more, examples: as of `PlainCommand`.
+        short, about, expected, brought, listed, more, examples: as of `advsearch.question.question`; `--code` allows
+            Python code that the runs, or the file, which it is about name.
     """
 
     name: str
     text: Callable[[Any], str] = output.shown_text
     short: Callable[[Any], bool] = lambda result: False
     about: str = ""
-    place: Positional | None = None
+    expected: tuple[Any, ...] | None = None
     brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None
     listed: str = ""
     more: str = ""
     examples: tuple[str, ...] = ()
+
+    @property
+    def place(self) -> tuple[str, str, str, bool]:
+        """How what it is about is given without its flag: what the help calls it, what is missing where neither is
+        given, what the help says more of it, and whether there may be several; the first is empty for not at all."""
+        metavar, missing, more, several = (*(self.expected or ("", "")), "", False)[:4]
+        return metavar, missing, more, several
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add a flag for each of the settings, and those that commands share."""
@@ -111,59 +109,45 @@ class QuestionCommand:
 
         add_settings(parser, CONFIGS[self.name])
         output.add_quiet_flags(parser)
-        if self.place:
-            parser.add_argument(
-                self.about,
-                metavar=self.place.metavar,
-                nargs="*" if self.place.several else "?",
-                default=argparse.SUPPRESS,
-                help=f"as `--{self.about}`{self.place.more}",
-            )
+        metavar, _, more, several = self.place
+        if metavar:
+            many, text = "*" if several else "?", f"as `--{self.about}`{more}"
+            parser.add_argument(self.about, metavar=metavar, nargs=many, default=argparse.SUPPRESS, help=text)
         if self.about:
             output.add_code_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         """Ask what the arguments say. Raises InputError where what it is about is missing."""
-        named = getattr(args, self.about, None)
+        named, (metavar, missing, _, _) = getattr(args, self.about, None), self.place
         if self.listed and named == "list":
             module, _, function = self.listed.partition(":")
             lines = getattr(importlib.import_module(module), function)()
             listed = [{"name": name, "title": text} for name, text in lines.items()]
             return output.say(args.json, {f"{self.name}s": listed}, output.aligned([*lines.items()]))
-        if self.place and named in (None, []):
+        if metavar and named in (None, []):
             command = f"advsearch {self.name}"
-            raise InputError(f"{command}: expected {self.place.expected}; see {command} --help")
+            raise InputError(f"{command}: expected {missing}; see {command} --help")
         if isinstance(named, list):
             setattr(args, self.about, ",".join(named))
         return self.carry_out(self.config(args), as_json=args.json, quiet=args.quiet)
 
-    def file(self, args: argparse.Namespace) -> Path | None:
-        """Return the settings of the first run that the question is about, if it is about one."""
-        # late, so that --help answers at once
-        from advsearch.runs.directory import CONFIG, find_run
-        from advsearch.settings import split_names
-
-        if self.about not in args:
-            return None
-        name = getattr(args, self.about)
-        if self.place and self.place.several:
-            name = next(iter(split_names(name)), name)
-        return find_run(name) / CONFIG
-
-    def config(self, args: argparse.Namespace, **over: Any) -> Config:
-        """Return the configuration that the arguments describe, over settings from elsewhere."""
+    def config(self, args: argparse.Namespace) -> Config:
+        """Return the configuration that the arguments describe, over what the first run that it is about brings."""
         # late, so that --help answers at once
         from advsearch.cli.flags import config_from
         from advsearch.config import CONFIGS
-        from advsearch.settings import settings
+        from advsearch.runs.directory import CONFIG, find_run
+        from advsearch.settings import settings, split_names
 
-        config = CONFIGS[self.name]
-        if self.brought and (file := self.file(args)):
-            over = {**self.brought(file, vars(args)), **over}
+        config, brought = CONFIGS[self.name], dict[str, Any]()
+        if self.brought and self.about in args:
+            name = getattr(args, self.about)
+            name = next(iter(split_names(name)), name) if self.place[3] else name
+            brought = self.brought(find_run(name) / CONFIG, vars(args))
         elif self.brought and (missing := [s.flag for s in settings(config) if s.required and s.field not in args]):
             command, run = f"advsearch {self.name}", f"--{self.about.replace('_', '-')} RUN"
             raise InputError(f"{command}: expected {missing[0]} NAME, or {run}; see {command} --help")
-        return config_from(args, config, **over)
+        return config_from(args, config, **brought)
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Ask what `config` describes, or go on with it; print the result and return the exit status."""
@@ -180,35 +164,33 @@ GROUPS = {
         ("attack", "sweep", "gap", "region", "explain", "compare", "recipe", "harden"), ""
     ),
     "look: at scenes, names and predictions": {
-        "render": "advsearch.cli.show:RENDER render a picture of a scene, and say what the model sees in it",
-        "show": "advsearch.cli.show:SHOW "
-        "show what a run found, or the details of a control, a policy, a task or a recipe",
-        "view": "advsearch.cli.dashboard:VIEW write the page of a run again, or a folder that any web server can serve",
-        "dashboard": "advsearch.cli.dashboard:DASHBOARD show the pages of runs in a browser on this machine",
+        "render": "show:RENDER render a picture of a scene, and say what the model sees in it",
+        "show": "show:show show what a run found, or the details of a control, a policy, a task or a recipe",
+        "view": "dashboard:view write the page of a run again, or a folder that any web server can serve",
+        "dashboard": "dashboard:dashboard show the pages of runs in a browser on this machine",
         "report": "",
-        "list": "advsearch.cli.show:LIST "
-        "list all names: objects, environments, controls, policies, tasks, objectives, models and recipes",
-        "labels": "advsearch.cli.show:LABELS find the names of a model's classes, as --label takes them",
+        "list": "show:list_all list all names: objects, environments, controls, policies, tasks, objectives, models "
+        "and recipes",
+        "labels": "show:labels find the names of a model's classes, as --label takes them",
     },
     "trust: does a result hold, and is the tool right?": {
         **dict.fromkeys(("test", "replay", "check", "precision", "stability"), ""),
-        "doctor": "advsearch.cli.doctor:DOCTOR check every part that a run needs, with versions and how to mend it",
+        "doctor": "doctor:doctor check every part that a run needs, with versions and how to mend it",
     },
     "files and runs: repeat, continue, bring in, take out": {
-        "run": "advsearch.cli.run:RUN do what a YAML file describes; the run.yaml of a run repeats it",
-        "resume": "advsearch.cli.run:RESUME continue a run that was stopped, from where it stopped",
-        "runs": "advsearch.cli.run:RUNS list the runs in a folder and how each ended",
-        "export": "advsearch.cli.export:EXPORT "
-        "export a run: its rows as a table, a texture for printing, a scene for Mitsuba or an object as glTF",
-        "import": "advsearch.cli.imports:IMPORT "
-        "show what advsearch reads from a mesh or scene file, as text or as a picture",
-        "completion": "advsearch.cli.completion:COMPLETION "
+        "run": "run:run do what a YAML file describes; the run.yaml of a run repeats it",
+        "resume": "run:resume continue a run that was stopped, from where it stopped",
+        "runs": "run:runs list the runs in a folder and how each ended",
+        "export": "export:export export a run: its rows as a table, a texture for printing, a scene for Mitsuba or an "
+        "object as glTF",
+        "import": "imports:file show what advsearch reads from a mesh or scene file, as text or as a picture",
+        "completion": "completion:completion "
         "print a script with which Tab finishes commands, flags and names in bash, zsh or tcsh",
-        "import-3db": "advsearch.cli.imports:IMPORT_3DB turn a folder that 3DB wrote into a run",
+        "import-3db": "imports:threedb turn a folder that 3DB wrote into a run",
     },
 }
 """Each command, in the groups and the order in which the help shows them: empty for a question, which is found by its
-name; for another command its module, the `PlainCommand` in it and what it does. A question that `question`
+name; for another command its module in this package, its function there and what it does. A question that `question`
 makes needs no line here: the help shows it behind the others that ask."""
 
 for _name in set(made_questions()).difference(*GROUPS.values()):
@@ -221,13 +203,10 @@ def command_named(name: str) -> Any:
     """Return the `QuestionCommand` or `PlainCommand` of a name."""
     if COMMANDS[name]:
         place, _, attribute = COMMANDS[name].partition(" ")[0].partition(":")
-        return getattr(importlib.import_module(place), attribute)
+        return getattr(importlib.import_module(f"advsearch.cli.{place}"), attribute)
     if made := made_question(name):
-        unflagged = Positional(*made.expected) if made.expected else None
-        return QuestionCommand(
-            name, short=made.short, about=made.about, place=unflagged, brought=made.brought, listed=made.listed,
-            more=made.more, examples=made.examples,
-        )  # fmt: skip
+        same = ("short", "about", "expected", "brought", "listed", "more", "examples")
+        return QuestionCommand(name, **{attribute: getattr(made, attribute) for attribute in same})
     return importlib.import_module(f"advsearch.questions.{name}").COMMAND
 
 
@@ -310,13 +289,13 @@ def _run_and_tell(words: list[str]) -> int:
 
 
 def _run(words: list[str]) -> int:
-    command = words[0] if words and not words[0].startswith("-") else None
-    if command == "plan":
+    name = words[0] if words and not words[0].startswith("-") else None
+    if name == "plan":
         raise InputError("`plan` is a part of `check` now: use advsearch check --loss model, with the same flags")
-    if command is not None and command not in COMMANDS:
-        raise UnknownNameError("command", command, COMMANDS, "See advsearch --help.")
+    if name is not None and name not in COMMANDS:
+        raise UnknownNameError("command", name, COMMANDS, "See advsearch --help.")
     try:
-        args = _parse(words, command)
+        args = _parse(words, name)
     except SystemExit as stop:  # --help and --version have printed their text
         return int(stop.code or 0)
     allow_code(*getattr(args, "code", ()))
@@ -338,10 +317,16 @@ def _parse(words: list[str], command: str | None) -> argparse.Namespace:
 
 def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAction[Any]]:
     """Return the parser, and what `add_command` adds the commands to."""
+    column = 4 + max(map(len, COMMANDS))
+    width = max(shutil.get_terminal_size().columns - 2, 2 * column)
+    lines = []
+    for title, commands in GROUPS.items():
+        texts = [f"  {name}".ljust(column) + help_of(name) for name in commands if name in COMMANDS]
+        lines += [title, *(textwrap.fill(text, width, subsequent_indent=" " * column) for text in texts), ""]
     parser = Parser(
         prog="advsearch",
         description="Find the scene that a vision model gets wrong most badly.",
-        epilog=f"{_listing()}\n{_EXAMPLES}",
+        epilog="\n".join([*lines, _EXAMPLES]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
@@ -354,20 +339,6 @@ def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAct
         parser_class=Parser,
     )
     return parser, subparsers
-
-
-def _listing() -> str:
-    """Return the commands with what they do, group by group, as wide as the terminal."""
-    column = 4 + max(map(len, COMMANDS))
-    width = max(shutil.get_terminal_size().columns - 2, 2 * column)
-    lines = []
-    for title, commands in GROUPS.items():
-        lines.append(title)
-        for name in filter(COMMANDS.__contains__, commands):
-            begin = f"  {name}".ljust(column)
-            lines.append(textwrap.fill(begin + help_of(name), width, subsequent_indent=" " * column))
-        lines.append("")
-    return "\n".join(lines)
 
 
 def add_command(

@@ -14,7 +14,8 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout, suppress
+from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
+from operator import methodcaller
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
@@ -51,20 +52,17 @@ class Screen:
 
     def write(self, text: str) -> int:
         """Write a text; errors as for `output_errors`."""
-        with self._errors():
+        with output_errors() if self._needed else suppress(OSError):
             self.stream.write(escaped(text, self.stream.encoding or "utf-8"))
         return len(text)
 
     def flush(self) -> None:
         """Write out what is held back; errors as for `write`."""
-        with self._errors():
+        with output_errors() if self._needed else suppress(OSError):
             self.stream.flush()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)
-
-    def _errors(self) -> AbstractContextManager[None]:
-        return output_errors() if self._needed else suppress(OSError)
 
 
 @contextmanager
@@ -114,33 +112,23 @@ def end_output() -> None:
 
 
 def _screen(stream: Any, *, needed: bool) -> TextIO:
-    if isinstance(stream, Screen):
-        return cast(TextIO, stream)
-    # Python has none where the descriptor was closed.
-    there: TextIO = stream if stream is not None else open(os.devnull, "w", encoding="utf-8")
-    return cast(TextIO, Screen(there, needed=needed))
+    if not isinstance(stream, Screen):  # Python has none where the descriptor was closed
+        stream = Screen(open(os.devnull, "w", encoding="utf-8") if stream is None else stream, needed=needed)
+    return cast(TextIO, stream)
 
 
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json``."""
-    parser.add_argument("--json", action="store_true", help="print one JSON value on standard output")
+add_flags = methodcaller("add_argument", "--json", action="store_true", help="print one JSON value on standard output")
+add_code_flag = methodcaller(
+    "add_argument", "--code", action="append", default=[], metavar="MODULE:NAME",
+    help="Python code that a file or a run names and that may be imported, as it stands there; may be repeated",
+)  # fmt: skip
+"""What adds flags to a parser: ``--json``; ``--code``, for commands that carry out the settings of a file."""
 
 
 def add_quiet_flags(parser: argparse.ArgumentParser) -> None:
     """Add ``--json`` and ``--quiet``, for commands that take their time."""
     add_flags(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress and no messages on standard error")
-
-
-def add_code_flag(parser: argparse.ArgumentParser) -> None:
-    """Add ``--code``, for commands that carry out the settings of a file."""
-    parser.add_argument(
-        "--code",
-        action="append",
-        default=[],
-        metavar="MODULE:NAME",
-        help="Python code that a file or a run names and that may be imported, as it stands there; may be repeated",
-    )
 
 
 def say(as_json: bool, facts: Mapping[str, object], text: str, stream: IO[str] | None = None) -> int:
@@ -169,8 +157,7 @@ def finish(result: Result, text: Callable[[Any], str], *, as_json: bool) -> int:
         print_json(result)
     else:
         print(text(result) + go_on_text(result))
-    stopped = getattr(result, "ending", None) == "interrupted"
-    return INTERRUPTED if stopped else OK
+    return INTERRUPTED if getattr(result, "ending", None) == "interrupted" else OK
 
 
 def go_on_text(result: Result) -> str:
@@ -182,29 +169,22 @@ def go_on_text(result: Result) -> str:
 
 def go_on_command(run: str | Path) -> str:
     """Return the shell command that goes on with the run in a folder, with the Python code that its settings name."""
-    from advsearch.runs.directory import CONFIG, typed_name  # late, so that --help answers at once
-
-    words = ["advsearch", "resume", typed_name(run)]
-    with suppress(AdvsearchError):
-        words += [word for name in _code_in(Path(run) / CONFIG) for word in ("--code", name)]
-    return shlex.join(words)
-
-
-def _code_in(file: Path) -> Sequence[str]:
     # late, so that --help answers at once
     from advsearch.cli.flags import command_in, config_of_file
     from advsearch.config import SceneConfig
+    from advsearch.runs.directory import CONFIG, typed_name
     from advsearch.settings import split_names
 
-    config = config_of_file(command_in(file), file, {})
-    if not isinstance(config, SceneConfig):
-        return ()
-    metrics = getattr(config, "metrics", {}).values()
-    if ":" not in "".join([config.model, *config.kinds_of_controls, *metrics]):
-        return ()
-    from advsearch.engine.naming import code_of  # takes seconds
+    words, file = ["advsearch", "resume", typed_name(run)], Path(run) / CONFIG
+    with suppress(AdvsearchError):
+        config = config_of_file(command_in(file), file, {})
+        metrics = getattr(config, "metrics", {}).values()
+        if isinstance(config, SceneConfig) and ":" in "".join([config.model, *config.kinds_of_controls, *metrics]):
+            from advsearch.engine.naming import code_of  # takes seconds
 
-    return code_of(split_names(config.model), config.kinds_of_controls, metrics)
+            names = code_of(split_names(config.model), config.kinds_of_controls, metrics)
+            words += [word for name in names for word in ("--code", name)]
+    return shlex.join(words)
 
 
 @contextmanager

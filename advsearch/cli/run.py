@@ -10,7 +10,7 @@ from pathlib import Path
 
 from advsearch.cli import main, output
 from advsearch.cli.flags import command_in, config_of_file
-from advsearch.cli.main import PlainCommand, argument
+from advsearch.cli.main import argument, command
 from advsearch.cli.show import show_run
 from advsearch.errors import InputError
 from advsearch.registry import allow_named
@@ -20,7 +20,16 @@ from advsearch.settings import parse_assignment
 from advsearch.settings.values import put
 
 
-def _run(args: argparse.Namespace) -> int:
+@command(
+    argument("file", metavar="FILE", help="YAML with settings and values, such as a run's run.yaml"),
+    argument("change", metavar="NAME=VALUE", nargs="*", help="a setting to change: steps=80"),
+    argument("--run", help="where the run is kept: a name (kept in runs/) or the path of a folder"),
+    argument("--overwrite", action="store_true", help="replace a run that is there already"),
+    output.add_code_flag,
+    output.add_quiet_flags,
+)
+def run(args: argparse.Namespace) -> int:
+    """Do what a file describes."""
     changes = changes_in(args.change)
     if args.run is not None:
         changes["run"] = args.run
@@ -50,31 +59,31 @@ def run_file(
             raise InputError(f"{file}: {setting.name}: {setting.does}, which a file can't ask for; type {setting.ask}")
         if not args.quiet:
             print(f"advsearch: {setting.name} is left out: it {setting.does}; type {setting.ask}", file=sys.stderr)
-    command = main.command_named(config.command)
-    return int(command.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
+    question = main.command_named(config.command)
+    return int(question.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
 
 
-RUN = PlainCommand(
-    _run,
-    (
-        argument("file", metavar="FILE", help="YAML with settings and values, such as a run's run.yaml"),
-        argument("change", metavar="NAME=VALUE", nargs="*", help="a setting to change: steps=80"),
-        argument("--run", help="where the run is kept: a name (kept in runs/) or the path of a folder"),
-        argument("--overwrite", action="store_true", help="replace a run that is there already"),
-        output.add_code_flag,
-        output.add_quiet_flags,
+@command(
+    argument("run", metavar="RUN", help="a run's name or folder"),
+    argument("change", metavar="NAME=VALUE", nargs="*", help="a setting to change that decides no number: threads=2"),
+    output.add_code_flag,
+    output.add_quiet_flags,
+    more="; what it has evaluated is not rendered again",
+    examples=(
+        "resume mug-texture-001",
+        "resume mug-check-001 seconds=600",
+        "resume mug-sweep-001 surface=true",
+        "resume realism-001 photographs=my-photographs",
     ),
 )
-
-
-def _resume(args: argparse.Namespace) -> int:
+def resume(args: argparse.Namespace) -> int:
     """Do what is left of the run and print its result; of a run that is done, its result."""
     path, changes = find_run(args.run), changes_in(args.change)
     if not (path / CONFIG).is_file():
         raise InputError(f"{path}: expected a run with its {CONFIG}, got none; it was stopped before it began")
-    command = command_in(path / CONFIG)
+    asked = command_in(path / CONFIG)
     # the map of a sweep's surface, or a recipe's figures anew, with the photographs that were taken since
-    adds = command == "recipe" or (changes.get("surface") is True and command == "sweep")
+    adds = asked == "recipe" or (changes.get("surface") is True and asked == "sweep")
     if finished(path) and not adds:
         print(f"advsearch: {path} is done already", file=sys.stderr)
         return show_run(str(path), args.json)
@@ -86,49 +95,25 @@ def _resume(args: argparse.Namespace) -> int:
     return run_file(path / CONFIG, changes, args, resumed=path)
 
 
-RESUME = PlainCommand(
-    _resume,
-    (
-        argument("run", metavar="RUN", help="a run's name or folder"),
-        argument(
-            "change", metavar="NAME=VALUE", nargs="*", help="a setting to change that decides no number: threads=2"
-        ),
-        output.add_code_flag,
-        output.add_quiet_flags,
-    ),
-    "; what it has evaluated is not rendered again",
-    (
-        "resume mug-texture-001",
-        "resume mug-check-001 seconds=600",
-        "resume mug-sweep-001 surface=true",
-        "resume realism-001 photographs=my-photographs",
-    ),
-)
-
-
 MOST_NAMES = 4  # controls of a run that the table names
 
 
-def _runs(args: argparse.Namespace) -> int:
+@command(argument("folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)"), output.add_flags)
+def runs(args: argparse.Namespace) -> int:
+    """List the runs in a folder."""
     folder = HOME if args.folder is None else Path(args.folder)
     if args.folder is not None and not os.path.isdir(folder):
         raise InputError(f"{folder}: expected a folder with runs in it, got no such folder")
-    runs = listed_runs(folder)
+    listed = listed_runs(folder)
     rows = [["run", "command", "object", "controls", "rows", "state", "result"]]
-    for run in runs:
+    for run in listed:
         names, more = ",".join(run.controls), len(run.controls) - MOST_NAMES
         if more > 1:
             names = f"{','.join(run.controls[:MOST_NAMES])} and {more} more"
         rows.append([run.name, run.command, run.object, names, str(run.rows), run.state, run.answer])
-    text = output.aligned(rows) if runs else f"no runs in {folder}/ yet; advsearch attack makes one"
-    output.say(args.json, {"command": "runs", "runs": [vars(run) for run in runs]}, text)
-    for run in runs:
+    text = output.aligned(rows) if listed else f"no runs in {folder}/ yet; advsearch attack makes one"
+    output.say(args.json, {"command": "runs", "runs": [vars(run) for run in listed]}, text)
+    for run in listed:
         if run.fault and not args.json:
             print(f"advsearch: {run.name}: {run.fault}", file=sys.stderr)
     return 0
-
-
-RUNS = PlainCommand(
-    _runs,
-    (argument("folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)"), output.add_flags),
-)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import main, output
 from advsearch.cli.flags import add_settings
-from advsearch.cli.main import PlainCommand, QuestionCommand, argument
+from advsearch.cli.main import QuestionCommand, argument, command
 from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
@@ -33,14 +33,28 @@ if TYPE_CHECKING:
     from advsearch.questions.photographs.result import PhotoAgreement
 
 
-def _show(args: argparse.Namespace) -> int:
+def _set_usage(parser: argparse.ArgumentParser) -> None:
+    parser.usage = "advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME"
+
+
+@command(
+    _set_usage,
+    argument(
+        "what",
+        nargs="+",
+        metavar="WHAT",
+        help="a run's name or folder; or: control NAME, policy NAME, task NAME, recipe NAME",
+    ),
+    argument("--picture", action="store_true", help="draw a run's pictures in a terminal that can"),
+    output.add_flags,
+)
+def show(args: argparse.Namespace) -> int:
+    """Show a run, or what has a name."""
     if args.picture and (args.json or len(args.what) > 1):
         raise InputError("--picture: draws the pictures of one run, after its text; give one run, and leave --json out")
     match args.what:
-        case ["control", name]:
-            return _show_control(name, args.json)
-        case ["policy" | "task" as kind, name]:
-            return _show_options(kind, name, args.json)
+        case ["control" | "policy" | "task" as kind, name]:
+            return _show_declared(kind, name, args.json)
         case ["recipe", name]:
             from advsearch.questions.recipe.description import read_recipe, recipe_yaml  # works without that room
 
@@ -70,7 +84,16 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     if as_json:
         output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)
     else:
-        print(text(result) + output.go_on_text(result) + (_photos_text(photos) if photos else ""))
+        print(text(result) + output.go_on_text(result))
+    if photos and photos.interval is not None and not as_json:
+        agreeing, total = photos.right_right + photos.wrong_wrong, count(photos.photos, "photograph")
+        sure = f"95 % interval {interval_text(photos.interval)}"
+        lines = [
+            ["", "photograph right", "photograph wrong"],
+            ["rendering right", str(photos.right_right), str(photos.right_wrong)],
+            ["rendering wrong", str(photos.wrong_right), str(photos.wrong_wrong)],
+        ]
+        print(f"\nRenderings and reality agree in {agreeing} of {total}, {sure}:\n{output.aligned(lines)}")
     if picture:
         show_pictures(best_pictures(path))
     return 0
@@ -85,20 +108,6 @@ def photos_of(run: Path) -> PhotoAgreement | None:
     from advsearch.questions.photographs.carry_out import photo_agreement  # takes seconds
 
     return photo_agreement(run)
-
-
-def _photos_text(table: PhotoAgreement) -> str:
-    if table.interval is None:
-        return ""
-    lines = [
-        ["", "photograph right", "photograph wrong"],
-        ["rendering right", str(table.right_right), str(table.right_wrong)],
-        ["rendering wrong", str(table.wrong_right), str(table.wrong_wrong)],
-    ]
-    agreeing = table.right_right + table.wrong_wrong
-    total = count(table.photos, "photograph")
-    text = f"Renderings and reality agree in {agreeing} of {total}, 95 % interval {interval_text(table.interval)}:"
-    return f"\n\n{text}\n{output.aligned(lines)}"
 
 
 def _show_unfinished(run: Listed, as_json: bool) -> int:
@@ -116,46 +125,38 @@ def _show_unfinished(run: Listed, as_json: bool) -> int:
     return output.say(as_json, {**vars(run), "run": run.path, "ending": None, "resume": go_on}, "\n".join(lines))
 
 
-def _show_control(name: str, as_json: bool) -> int:
+PLURALS = {"control": "controls", "policy": "policies", "task": "tasks"}
+
+
+def _show_declared(kind: str, name: str, as_json: bool) -> int:
     with at_work(as_json=True, quiet=False):
-        from advsearch.controls import CONTROLS  # takes seconds
-
-    allow_named({"controls": name})
-    if name not in CONTROLS:
-        raise UnknownNameError("control", name, CONTROLS)
-    control = CONTROLS[name]
-    parameters, choices = control.parameters, control.choices
-    parts = [f"{name}: {first_doc_line(control)}"]
-    if parameters:
-        parts.append("parameters, searched or fixed:\n" + _table(list(map(_of_parameter, parameters))))
-    else:
-        parts.append(f"The scene names its parameters: --control {name}:KEY=[low, high]")
-    if choices:
-        parts.append("settings, chosen:\n" + _table(list(map(_of_choice, choices))))
-    facts = {"control": name, "parameters": plain(parameters), "choices": plain(choices)}
-    return output.say(as_json, facts, "\n\n".join(parts))
-
-
-def _show_options(kind: str, name: str, as_json: bool) -> int:
-    with at_work(as_json=True, quiet=False):
-        # take seconds
-        from advsearch.attacks import POLICIES
-        from advsearch.tasks import TASKS
-
-    registry: Mapping[str, type[Any]] = POLICIES if kind == "policy" else TASKS
+        registry = _registry(PLURALS[kind])  # takes seconds
+    allow_named({"controls": name} if kind == "control" else {})
     if name not in registry:
         raise UnknownNameError(kind, name, registry)
-    entry, options = registry[name], list[dict[str, Any]]()
-    for option, field in declared_options(entry).items():
-        default = default_of(field)
-        options.append({"name": option, "type": type_of(field), "default": plain(getattr(default, "name", default))})
-    rows = [{**option, "default": _cell(option["default"])} for option in options]
-    table = f"options, as in --{kind} '{name}={{OPTION: VALUE}}':\n{_table(rows)}" if rows else "It has no options."
-    return output.say(as_json, {kind: name, "options": options}, f"{name}: {first_doc_line(entry)}\n\n{table}")
+    entry, parts = registry[name], list[str]()
+    facts: dict[str, object] = {kind: name}
+    if kind == "control":
+        facts |= {"parameters": plain(entry.parameters), "choices": plain(entry.choices)}
+        if entry.parameters:
+            parts.append("parameters, searched or fixed:\n" + _table(list(map(_of_parameter, entry.parameters))))
+        else:
+            parts.append(f"The scene names its parameters: --control {name}:KEY=[low, high]")
+        if entry.choices:
+            parts.append("settings, chosen:\n" + _table(list(map(_of_choice, entry.choices))))
+    else:
+        options = list[dict[str, Any]]()
+        for option, field in declared_options(entry).items():
+            default = default_of(field)
+            default = plain(getattr(default, "name", default))
+            options.append({"name": option, "type": type_of(field), "default": default})
+        facts["options"], rows = options, [{**option, "default": _cell(option["default"])} for option in options]
+        how = f"options, as in --{kind} '{name}={{OPTION: VALUE}}':"
+        parts.append(f"{how}\n{_table(rows)}" if rows else "It has no options.")
+    return output.say(as_json, facts, "\n\n".join([f"{name}: {first_doc_line(entry)}", *parts]))
 
 
 def _of_parameter(parameter: Parameter) -> dict[str, str]:
-    """What a person wants to read of a parameter, in few columns."""
     count = " x ".join("any" if side is None else str(side) for side in parameter.shape)
     low, high = parameter.search or (0.0, 0.0)
     searched = f"{low:g} to {high:g}" + (", log" if parameter.log else "")
@@ -226,7 +227,6 @@ def show_pictures(files: Sequence[Path]) -> None:
 
 
 def _drawing() -> tuple[Callable[[Path], None] | None, str]:
-    """What draws a picture in this terminal, or None and what to do about it."""
     if not sys.stdout.isatty():
         return None, ""
     try:
@@ -239,26 +239,6 @@ def _drawing() -> tuple[Callable[[Path], None] | None, str]:
 
     console = Console(file=raw(sys.stdout))
     return lambda file: console.print(renderable.Image(file, height=HEIGHT)), ""
-
-
-def _set_usage(parser: argparse.ArgumentParser) -> None:
-    parser.usage = "advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME"
-
-
-SHOW = PlainCommand(
-    _show,
-    (
-        _set_usage,
-        argument(
-            "what",
-            nargs="+",
-            metavar="WHAT",
-            help="a run's name or folder; or: control NAME, policy NAME, task NAME, recipe NAME",
-        ),
-        argument("--picture", action="store_true", help="draw a run's pictures in a terminal that can"),
-        output.add_flags,
-    ),
-)
 
 
 def render_text(result: RenderResult) -> str:
@@ -313,24 +293,18 @@ REGISTRIES = {kind: place for kind, place in _EVERY.items() if there(place)}
 MODELS = {"reference": "the bundled classifier of household objects; models of your own are given as files"}
 
 
-def _list(args: argparse.Namespace) -> int:
-    kinds = [kind for kind in REGISTRIES if kind != CASES] if args.kind == "all" else [args.kind]
-    with at_work(as_json=True, quiet=False):
-        names = {kind: list_names(kind) for kind in kinds}
-    tables = {kind: output.aligned([*entries.items()]) for kind, entries in names.items()}
-    text = "\n\n".join(f"{kind}:\n{table}" for kind, table in tables.items())
-    facts = {kind: list(entries) for kind, entries in names.items()}
-    return output.say(args.json, facts, text if args.kind == "all" else tables[args.kind])
-
-
 def list_names(kind: str) -> dict[str, str]:
     """Return the names of one kind, each with one line about it where its registry has one."""
-    module, _, attribute = REGISTRIES[kind].partition(":")
-    registry = getattr(importlib.import_module(module), attribute)
-    entries = registry() if callable(registry) else registry
+    entries = _registry(kind)
     if isinstance(entries, Mapping):
         return {str(name): first_doc_line(entry) for name, entry in entries.items()}
     return {str(name): "" for name in entries}
+
+
+def _registry(kind: str) -> Any:
+    module, _, attribute = REGISTRIES[kind].partition(":")
+    registry = getattr(importlib.import_module(module), attribute)
+    return registry() if callable(registry) else registry
 
 
 def first_doc_line(entry: Any) -> str:
@@ -341,53 +315,49 @@ def first_doc_line(entry: Any) -> str:
     return (inspect.getdoc(documented) or "").partition("\n")[0]
 
 
-LIST = PlainCommand(
-    _list,
-    (argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all"), output.add_flags),
+@command(
+    argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all"), output.add_flags
 )
+def list_all(args: argparse.Namespace) -> int:
+    """Print the names of one kind, or of all."""
+    kinds = [kind for kind in REGISTRIES if kind != CASES] if args.kind == "all" else [args.kind]
+    with at_work(as_json=True, quiet=False):
+        names = {kind: list_names(kind) for kind in kinds}
+    tables = {kind: output.aligned([*entries.items()]) for kind, entries in names.items()}
+    text = "\n\n".join(f"{kind}:\n{table}" for kind, table in tables.items())
+    facts = {kind: list(entries) for kind, entries in names.items()}
+    return output.say(args.json, facts, text if args.kind == "all" else tables[args.kind])
 
 
-def _labels(args: argparse.Namespace) -> int:
+@command(
+    argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it"),
+    partial(add_settings, only=("model", "labels")),
+    output.add_flags,
+    more=". With --labels the model itself is not loaded. What stands for no thing, such as background, is left out",
+    examples=("labels", "labels mug --labels labels.json", "labels mug --model model.pt2 --labels labels.json --json"),
+)
+def labels(args: argparse.Namespace) -> int:
     """Print index and name of the classes, best first. Raises InputError where no class is like the word, or the model
     has no names for its classes."""
     with at_work(as_json=True, quiet=False):
-        from advsearch.models.labels import matching_labels, names_nothing  # late, so that --help answers at once
+        # late, so that --help answers at once
+        from advsearch.models import load_model, read_labels
+        from advsearch.models.labels import matching_labels, names_nothing
 
-        labels = class_names(getattr(args, "model", "reference"), getattr(args, "labels", None))
-        if args.word is None:
-            indices = list(range(len(labels)))
+        if "labels" in args and args.labels is not None:
+            names = read_labels(args.labels)
         else:
-            indices = [index for index, _ in matching_labels(args.word, labels)]
-        if args.word is None or not names_nothing(args.word):
-            indices = [index for index in indices if not names_nothing(labels[index])]
-    if not indices:
-        raise InputError(f"none of the {len(labels)} labels is like {args.word!r}; leave the word out to see all")
-    listed = [{"index": index, "label": labels[index]} for index in indices]
-    text = output.aligned([[f"#{index}", labels[index]] for index in indices])
+            allow_named({"model": (model := getattr(args, "model", "reference"))})
+            loaded = load_model(model)
+            if not loaded.named:
+                what = f"model {loaded.name} has {loaded.classes} classes without names"
+                raise InputError(f"{what}; give a file with `labels`")
+            names = loaded.labels
+        like = range(len(names)) if args.word is None else [index for index, _ in matching_labels(args.word, names)]
+        asked = args.word is not None and names_nothing(args.word)
+        found = {index: names[index] for index in like if asked or not names_nothing(names[index])}
+    if not found:
+        raise InputError(f"none of the {len(names)} labels is like {args.word!r}; leave the word out to see all")
+    listed = [{"index": index, "label": name} for index, name in found.items()]
+    text = output.aligned([[f"#{index}", name] for index, name in found.items()])
     return output.say(args.json, {"command": "labels", "word": args.word, "labels": listed}, text)
-
-
-def class_names(model: str, labels: str | None) -> tuple[str, ...]:
-    """Return the names of a model's classes in index order: those of a file, or else the model's own. Raises InputError
-    where the model has none."""
-    from advsearch.models import load_model, read_labels  # late, so that --help answers at once
-
-    if labels is not None:
-        return read_labels(labels)
-    allow_named({"model": model})
-    loaded = load_model(model)
-    if not loaded.named:
-        raise InputError(f"model {loaded.name} has {loaded.classes} classes without names; give a file with `labels`")
-    return loaded.labels
-
-
-LABELS = PlainCommand(
-    _labels,
-    (
-        argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it"),
-        partial(add_settings, only=("model", "labels")),
-        output.add_flags,
-    ),
-    ". With --labels the model itself is not loaded. What stands for no thing, such as background, is left out",
-    ("labels", "labels mug --labels labels.json", "labels mug --model model.pt2 --labels labels.json --json"),
-)

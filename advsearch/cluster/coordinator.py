@@ -10,7 +10,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 from advsearch.cluster import Done, Pool, SchedulerGoneError, Work, WorkerDiedError, Workforce
@@ -36,8 +38,7 @@ POLL = 0.5  # seconds between two looks at the clock, and at who is there
 @dataclass(eq=False)
 class _Batch:
     items: Sequence[Any]
-    turn: int
-    """The call of `results` that wants it."""
+    turn: int  # the call of `results` that wants it
     deaths: int = 0
 
 
@@ -47,8 +48,7 @@ class _Worker:
     ready: bool = False
     sent: bool = False
     machine: str | None = None
-    call: Future[Any] | None = None
-    """What it is at since when: a batch, or, with none, it gets ready."""
+    call: Future[Any] | None = None  # what it is at since when: a batch, or, with none, it gets ready
     batch: _Batch | None = None
     since: float = 0.0
 
@@ -98,12 +98,17 @@ class Coordinator:
                 if self._clock() - self._looked_at >= POLL:
                     yield from self._look_around()
                 self._give_out(source)
-                if not self._todo and not self._under_way:
-                    items = next(source, None)  # there may be more, and nobody yet who is ready for it
-                    if items is None:
+                if not self._todo and not self._under_way:  # there may be more, and nobody yet who is ready for it
+                    self._todo.extend(_Batch(items, turn) for items in islice(source, 1))
+                    if not self._todo:
                         return
-                    self._todo.append(_Batch(items, turn))
-                yield from self._answers()
+                ended = list[Future[Any]]()
+                with suppress(queue.Empty):  # of a moment
+                    ended.append(self._pool.ended.get(timeout=POLL))
+                    while True:
+                        ended.append(self._pool.ended.get_nowait())
+                # as a list: nobody may go on asking
+                yield from [done for future in ended for done in self._answered(future)]
         finally:
             if turn == self._turn:
                 self._turn += 1
@@ -112,13 +117,11 @@ class Coordinator:
     # ---- giving out -------------------------------------------------------------------------------------------------
 
     def _give_out(self, source: Iterator[Sequence[Any]]) -> None:
-        """Give batches to workers that have nothing to do."""
         while self._idle:
             if not self._todo:
-                items = next(source, None)
-                if items is None:
-                    return
-                self._todo.append(_Batch(items, self._turn))
+                self._todo.extend(_Batch(items, self._turn) for items in islice(source, 1))
+            if not self._todo:
+                return
             worker = self._idle.popleft()
             if self._workers.get(worker.address) is worker:  # it has not gone meanwhile
                 worker.batch = batch = self._todo.popleft()
@@ -138,18 +141,6 @@ class Coordinator:
 
     # ---- what comes back --------------------------------------------------------------------------------------------
 
-    def _answers(self) -> Iterator[Done]:
-        """Wait a moment for a call that ends, and yield what came of all that have."""
-        ended = list[Future[Any]]()
-        try:
-            ended.append(self._pool.ended.get(timeout=POLL))
-            while True:
-                ended.append(self._pool.ended.get_nowait())
-        except queue.Empty:
-            pass
-        # as a list: nobody may go on asking
-        yield from [done for future in ended for done in self._answered(future)]
-
     def _answered(self, future: Future[Any]) -> Iterator[Done]:
         if future not in self._owners or future.cancelled():
             return  # late, or the scheduler has gone, which the next look tells
@@ -165,7 +156,19 @@ class Coordinator:
         wanted = batch is not None and batch.turn == self._turn
         self._under_way -= wanted
         if isinstance(value, Ready):
-            self._is_ready(worker, value)
+            name = machine_name(value.machine)
+            if name != self._here:
+                worker.machine = name
+                if name not in self.facts.machines:
+                    self.facts.machines = {**self.facts.machines, name: value.machine}
+                    told = ", ".join(f"{key} {text}" for key, text in value.machine.items())
+                    self._tell(f"{worker.address} is another machine than this ({told}): last bits of rows may differ")
+            self._count_time()
+            self._load_deaths, worker.ready = 0, True
+            self._idle.append(worker)
+            self.facts.loading += value.seconds
+            self.facts.workers += 1
+            self.facts.most = max(self.facts.most, self.facts.workers)
         elif isinstance(value, Carried) and batch is not None:
             self.facts.batches += 1
             self.facts.busy += value.seconds
@@ -193,26 +196,9 @@ class Coordinator:
         else:
             raise ClusterError(value.text)
 
-    def _is_ready(self, worker: _Worker, value: Ready) -> None:
-        name = machine_name(value.machine)
-        if name != self._here:
-            worker.machine = name
-            if name not in self.facts.machines:
-                self.facts.machines = {**self.facts.machines, name: value.machine}
-                told = ", ".join(f"{key} {text}" for key, text in value.machine.items())
-                self._tell(f"{worker.address} is another machine than this ({told}): last bits of rows may differ")
-        self._count_time()
-        self._load_deaths = 0
-        self.facts.loading += value.seconds
-        worker.ready = True
-        self._idle.append(worker)
-        self.facts.workers += 1
-        self.facts.most = max(self.facts.most, self.facts.workers)
-
     # ---- workers that come and go -----------------------------------------------------------------------------------
 
     def _look_around(self) -> Iterator[Done]:
-        """See who has come and gone, and who takes too long."""
         self._count_time()
         now = self._looked_at = self._clock()
         try:
@@ -249,7 +235,6 @@ class Coordinator:
             self._give_up(f"there was no worker that can do it for {patience:.0f} s")
 
     def _died(self, worker: _Worker) -> Iterator[Done]:
-        """Take back what a worker had, which it may have died of."""
         self.facts.lost += 1
         self._avoided[worker.address] = ""  # until it is seen to be gone
         batch = self._take_back(worker)
@@ -270,7 +255,6 @@ class Coordinator:
             yield Done(batch.items, None, worker.address, lost=f"no answer: {batch.deaths} workers died of it")
 
     def _take_back(self, worker: _Worker) -> _Batch | None:
-        """Give a worker nothing more; put what it had back in front, and return it."""
         self._count_time()
         self._workers.pop(worker.address, None)
         self.facts.workers -= worker.ready

@@ -171,12 +171,9 @@ class DaskPool:
                     self._cluster = self._site.start(**({} if security is None else {"security": security}))
                     if self._site.count is not None:
                         self._cluster.scale(self._site.count)
-                self._client = made.Client(
-                    self._cluster or self._site.address,
-                    security=security,
-                    timeout=max(1.0, min(CONNECT, deadline - time.monotonic())),
-                    set_as_default=False,
-                )
+                left = max(1.0, min(CONNECT, deadline - time.monotonic()))
+                where = self._cluster or self._site.address
+                self._client = made.Client(where, security=security, timeout=left, set_as_default=False)
                 break
             except (OSError, TimeoutError, asyncio.TimeoutError, RuntimeError, ValueError) as error:
                 if time.monotonic() >= deadline:
@@ -270,13 +267,8 @@ class DaskPool:
 LOCAL = "local"
 SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
 
-CLASSES = {
-    **dict.fromkeys(
-        ("SLURMCluster", "PBSCluster", "LSFCluster", "SGECluster", "MoabCluster", "OARCluster", "HTCondorCluster"),
-        "dask_jobqueue",
-    ),
-    "KubeCluster": "dask_kubernetes.operator",
-}
+JOBS = ("SLURMCluster", "PBSCluster", "LSFCluster", "SGECluster", "MoabCluster", "OARCluster", "HTCondorCluster")
+CLASSES = {**dict.fromkeys(JOBS, "dask_jobqueue"), "KubeCluster": "dask_kubernetes.operator"}
 """Classes of clusters that a file may name, and where each is; anything else would be code that the file runs."""
 
 
@@ -329,9 +321,8 @@ def _from_file(path: Path, workers: int | None) -> Site:
     unknown = sorted(set(said) - {"address", "class", "arguments", "workers", "security"})
     if unknown or ("address" in said) == ("class" in said):
         got = f"got {', '.join(map(str, unknown))}" if unknown else "got both or neither"
-        raise FileFormatError(
-            f"{path}: expected either address, or class with arguments and workers; beside it security; {got}"
-        )
+        expected = "expected either address, or class with arguments and workers; beside it security"
+        raise FileFormatError(f"{path}: {expected}; {got}")
     for name in ("security", "arguments"):
         given = said.get(name) or {}
         if not isinstance(given, dict) or not all(isinstance(key, str) for key in given):
@@ -340,7 +331,7 @@ def _from_file(path: Path, workers: int | None) -> Site:
     for name in ("tls_ca_file", "tls_client_cert", "tls_client_key", "tls_scheduler_cert", "tls_scheduler_key"):
         if isinstance(security.get(name), str):
             security[name] = str(path.parent / security[name])
-    count = workers if workers is not None else said.get("workers")
+    count = said.get("workers") if workers is None else workers
     if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
         raise FileFormatError(f"{path}: workers: expected a whole number of at least 1, got {count!r}")
     if "address" in said:

@@ -104,8 +104,12 @@ def read_files(work: Work) -> Files:
     contents: dict[str, bytes] = {}
     for value in map(work.settings.get, work.files):
         for part in _split(value) if isinstance(value, str) else ():
-            if os.path.isabs(part) and Path(part).is_file():
-                contents |= {str(path): path.read_bytes() for path in _with_others(Path(part))}
+            path = Path(part)
+            if path.is_absolute() and path.is_file():
+                kinds = WITH_OTHERS.get(path.suffix.lower(), ())
+                others = sorted(path.parent.rglob("*")) if kinds else []
+                beside = [file for file in others if file.suffix.lower() in (*kinds, *PICTURES) and file.is_file()]
+                contents |= {str(file): file.read_bytes() for file in (path, *beside)}
     size = sum(map(len, contents.values()))
     if size > LARGEST:
         raise InputError(
@@ -149,13 +153,6 @@ def _split(value: str) -> Iterator[str]:
         first, *second = split_paths(path)
         yield first
         yield from ("+", *second) if second else (mark + inner,)
-
-
-def _with_others(path: Path) -> Iterator[Path]:
-    yield path
-    if path.suffix.lower() in WITH_OTHERS:
-        kinds = (*WITH_OTHERS[path.suffix.lower()], *PICTURES)
-        yield from (file for file in sorted(path.parent.rglob("*")) if file.suffix.lower() in kinds and file.is_file())
 
 
 MOST_LOADED = 2  # works that a worker holds; the one that was not used for longest goes
@@ -238,7 +235,6 @@ def own_folder() -> Path:
 
 @lru_cache(MOST_LOADED)
 def _call_of(key: str) -> Call:
-    """Return what carries out a work, loaded if it is not."""
     work = _known[key]
     threads.configure(work.threads)
     module, _, name = work.function.partition(":")

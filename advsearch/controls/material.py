@@ -24,7 +24,7 @@ from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, Floats, Material, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.raster import looked_up, texel_positions
+from advsearch.scene.raster import looked_up, rasterised
 from advsearch.scene.settings import CHANNELS, MATERIAL, colors
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -381,8 +381,8 @@ def covering(mesh: Mesh, name: str, side: int = SIDE) -> Floats:
 @lru_cache(maxsize=2)
 def _places(mesh: Mesh, side: int) -> tuple[Floats, Floats]:
     """Positions and normals (side, side, 3) behind the texels of a mesh."""
-    positions, normals, _ = texel_positions(mesh, side)
-    return positions, normals
+    charts = rasterised(mesh, side)
+    return charts.positions(), charts.normals()
 
 
 OWN = "own"

@@ -37,7 +37,7 @@ from advsearch.scene.assets import Bools, Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import texel_area, texels_of_faces
+from advsearch.scene.raster import rasterised, texels_of_faces
 
 RESOLUTIONS = (256, 512)  # smallest and largest side that is taken from the object's own texture when none is asked for
 DEFAULT_EPSILON = 0.1
@@ -162,7 +162,7 @@ class TextureControl(Control):
         texels, norm = original[mask], self.chosen["norm"]
         epsilon = self._given.get("epsilon")
         if self.form == "palette":
-            area = np.where(mask.numpy(), texel_area(mesh, shape), 0.0).astype(np.float32)
+            area = np.where(mask.numpy(), rasterised(mesh, shape).areas(), 0.0).astype(np.float32)
             weight = area if area.any() else mask.numpy().astype(np.float32)
             centres = palette(original, weight, int(self.chosen["colors"]))
             return recoloured(texels, centres, ball(norm, epsilon, centres.numel()))

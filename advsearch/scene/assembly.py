@@ -21,7 +21,7 @@ from torch import Tensor
 from advsearch.scene.assets import Mesh
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import camera_to_world, driving, projected, seated
-from advsearch.scene.gradients import DEFAULT_PIXELS, DEFAULT_STEP, STEP_RANGE, Group
+from advsearch.scene.gradients import Group
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass
 
 ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})
@@ -67,14 +67,12 @@ class MovingMesh:
 
     @cached_property
     def _sharing(self) -> tuple[Tensor, Tensor]:
-        """Faces (F, 3), and for each vertex the number (V,) of those that share its place and normal."""
         rounded = np.round(np.concatenate([self._mesh.vertices * 1e5, self._mesh.normals * 1e3], axis=1))
         groups = np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1)
         return torch.from_numpy(self._mesh.faces.astype(np.int64)), torch.from_numpy(groups.astype(np.int64))
 
 
-AWAY = 1000.0
-"""Object sizes to the side, where a thing is under a pixel wide."""
+AWAY = 1000.0  # object sizes to the side, where a thing is under a pixel wide
 
 
 class Assembly:
@@ -98,8 +96,14 @@ class Assembly:
             pose[1, 3] += AWAY
             inputs = {**inputs, f"{OBJECT}.to_world": pose}
         parameters = dict(inputs)
-        for part in self._carried:
-            parameters |= _with_carrier(part, inputs)
+        for part in self._carried:  # what carries it may be moved or deformed
+            pose, offsets = (inputs.get(f"{part.carrier}.{what}") for what in ("to_world", "offsets"))
+            if isinstance(part, LampGlass) and offsets is not None:
+                parameters[f"{part.name}.offsets"] = offsets[torch.from_numpy(part.follows).to(offsets.device)]
+            if pose is not None and isinstance(part, BeamLamp):
+                pose = seated(driving(pose) if part.carrier == CAMERA else pose, torch.from_numpy(part.seat).to(pose))
+            if pose is not None:
+                parameters[f"{part.name}.to_world"] = pose
         for name, mesh in self.meshes.items():
             to_world, offsets = parameters.pop(f"{name}.to_world", None), parameters.pop(f"{name}.offsets", None)
             if to_world is not None or offsets is not None:
@@ -114,24 +118,13 @@ class Assembly:
             parameters["environment.padded"] = torch.cat([data[:, -1:], data, data[:, :1]], dim=1)
         return parameters
 
-
-def _with_carrier(part: BeamLamp | LampGlass, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The inputs of what a mesh or the camera carries, where that is moved or deformed."""
-    pose, offsets = (inputs.get(f"{part.carrier}.{what}") for what in ("to_world", "offsets"))
-    carried: dict[str, Tensor] = {}
-    if isinstance(part, LampGlass):
-        if offsets is not None:
-            carried[f"{part.name}.offsets"] = offsets[torch.from_numpy(part.follows).to(offsets.device)]
-        if pose is not None:
-            carried[f"{part.name}.to_world"] = pose
-    elif pose is not None:
-        seat = torch.from_numpy(part.seat).to(pose)
-        carried[f"{part.name}.to_world"] = seated(driving(pose) if part.carrier == CAMERA else pose, seat)
-    return carried
+    def vertices(self, name: str, assembled: Mapping[str, Tensor]) -> Tensor:
+        """Return the vertices (V, 3) that a mesh has in world space, by inputs as a call returns them."""
+        moved = assembled.get(f"{name}.vertices")
+        return self.meshes[name].place(None, None)[0] if moved is None else moved
 
 
-Value = Callable[[Tensor], Tensor]
-"""From a configuration (d,) to one number, at one seed."""
+Value = Callable[[Tensor], Tensor]  # from a configuration (d,) to one number, at one seed
 
 
 def central(value: Value, group: Group, u: Tensor, derivative: Tensor) -> None:
@@ -145,33 +138,25 @@ def central(value: Value, group: Group, u: Tensor, derivative: Tensor) -> None:
 
 
 def moved(u: Tensor, step: Tensor, periodic: bool | Tensor) -> tuple[Tensor, Tensor]:
-    """Return u + step brought back into the box, and the step that was really taken.
-
-    Periodic coordinates wrap around, so that they can go the whole step.
-    """
+    """Return u + step brought back into the box, and the step that was really taken. Periodic coordinates wrap around,
+    so that they can go the whole step."""
     there = u + step
     clipped, cyclic = there.clamp(0.0, 1.0), torch.as_tensor(periodic).expand(u.shape)
     return torch.where(cyclic, torch.remainder(there, 1.0), clipped), torch.where(cyclic, step, clipped - u)
 
 
-POINTS = 400
-"""Vertices of a mesh that are followed."""
+POINTS = 400  # vertices of a mesh that are followed
 NUDGES = (2e-3, 2e-4, 2e-5, 2e-6)
 """Changes of u that the speed is measured over: the largest that leaves something in the frame."""
-DIRECTIONS = 4000
-"""Directions in which the environment is followed: some hundred of them lie in a frame."""
-EDGE = 25
-"""Points that are followed along each side of the ground plane."""
-FAR = 1e4
-"""How far away its points are taken to be, in scene units."""
+DIRECTIONS = 4000  # directions in which the environment is followed: some hundred of them lie in a frame
+EDGE = 25  # points that are followed along each side of the ground plane
+FAR = 1e4  # how far away its points are taken to be, in scene units
 
 
 class Motion:
     """Projects a scene's vertices, the table's edge or the floor, and what is seen of the environment into the picture,
-    of a resolution (height, width) in pixels; the assembly makes vertices from poses.
-
-    A camera that goes around an object hardly moves the object's outline, but all that lies behind it.
-    """
+    of a resolution (height, width) in pixels; the assembly makes vertices from poses. A camera that goes around an
+    object hardly moves the object's outline, but all that lies behind it."""
 
     def __init__(self, description: SceneDescription, resolution: tuple[int, int], assembly: Assembly) -> None:
         self._description, self._resolution, self._assembly = description, resolution, assembly
@@ -199,15 +184,9 @@ class Motion:
     def pixels(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Return where the followed vertices lie, (N, 2) pixels from the middle, and which are in or near the frame."""
         camera = inputs["camera.to_world"].double() if "camera.to_world" in inputs else self._camera
-        points = []
-        for name, mesh in self._assembly.meshes.items():
-            vertices = inputs.get(f"{name}.vertices")
-            if vertices is None:
-                vertices = mesh.place(None, None)[0]
-            points.append(vertices[self._picks[name]].double())
-        points += [self._edge, self._far]
+        points = [self._assembly.vertices(name, inputs)[picks].double() for name, picks in self._picks.items()]
         eye = camera[:3, 3]
-        relative = (torch.cat(points) - eye) @ camera[:3, :3]
+        relative = (torch.cat([*points, self._edge, self._far]) - eye) @ camera[:3, :3]
         places, seen = projected(self._description, inputs, relative, self._resolution)
         # Which of the far points the ground plane hides
         ways = self._far - eye
@@ -233,10 +212,3 @@ class Motion:
                         speeds[number] = float(distances.max()) / size
                         break
         return speeds
-
-
-def steps_for(speeds: Tensor, pixels: float = DEFAULT_PIXELS) -> Tensor:
-    """Return half-widths of differences in u: `pixels` of motion, or `DEFAULT_STEP` where nothing moves."""
-    moving = speeds > 1e-3
-    wanted = torch.where(moving, pixels / speeds.clamp_min(1e-3), torch.full_like(speeds, DEFAULT_STEP))
-    return wanted.clamp(*STEP_RANGE)

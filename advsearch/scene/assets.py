@@ -26,8 +26,7 @@ Floats = npt.NDArray[np.float32]
 Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
-SLACK = 1e-3
-"""How far texture coordinates of a texture that does not repeat may lie beyond its edges."""
+SLACK = 1e-3  # how far texture coordinates of a texture that does not repeat may lie beyond its edges
 
 
 class MeshRig(Protocol):
@@ -212,10 +211,8 @@ class Simpler:
     faces: npt.NDArray[np.uint32]  # (G, 3) indices of those left
 
     def of(self, mesh: Mesh) -> Mesh:
-        """Return what is left of the mesh, or of one that only stands elsewhere.
-
-        Each vertex stands at the mean of those that came together there.
-        """
+        """Return what is left of the mesh, or of one that only stands elsewhere. Each vertex stands at the mean of
+        those that came together there."""
         counts = np.bincount(self.places)
         mean = np.stack([np.bincount(self.places, mesh.vertices[:, axis]) / counts for axis in range(3)], axis=1)
         places: Floats = mean[self.place].astype(np.float32)
@@ -223,12 +220,10 @@ class Simpler:
 
 
 def simpler(mesh: Mesh, most: int) -> Simpler | None:
-    """Return how a mesh is shown with at most `most` faces, or the fewest of a coarse grid; None: it has no more.
-
-    After Rossignac and Borrel (1993, "Multi-resolution 3D approximations for rendering complex scenes"): vertices are
+    """Return how a mesh is shown with at most `most` faces, or the fewest of a coarse grid; None: it has no more. After
+    Rossignac and Borrel (1993, "Multi-resolution 3D approximations for rendering complex scenes"): vertices are
     clustered by a grid, and a face of which two corners meet is left out. Both sides of a seam of the texture move
-    together, so that no gap opens.
-    """
+    together, so that no gap opens."""
     if len(mesh.faces) <= most:
         return None
     low = mesh.vertices.min(axis=0)

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.camera_model import COEFFICIENTS, EQUIRECTANGULAR, CameraModel
+from advsearch.scene.camera_model import COEFFICIENTS, EQUIRECTANGULAR, NUMBERS, CameraModel
 from advsearch.scene.importing.files import shown
 
 MOST_PIXELS = 1 << 16  # largest side of a picture
@@ -47,16 +47,12 @@ def plain(name: str) -> str:
 
 
 class Entries:
-    """The entries of a camera, by plain names.
+    """The entries of a camera in the file of a path, by plain names.
 
         entries.get("cameramatrix", "k")   # the first that is there; None where none is
         entries.told()                     # what is said of those that nobody got
 
     Raises FileFormatError: two of them have one name but for case and underscores.
-
-    Args:
-        path: of the file, for messages.
-        given: the entries as they are spelled.
     """
 
     def __init__(self, path: str, given: Mapping[str, Any]) -> None:
@@ -85,8 +81,9 @@ class Entries:
 
     def number(self, name: str, otherwise: float | None = None, names: Sequence[str] = ()) -> float:
         """Return a finite number, or what holds otherwise. Raises FileFormatError: it is none, or has to be there."""
-        value = self.there(name, names) if otherwise is None else self.get(*(names or (plain(name),)))
-        return number(self.path, name, otherwise if value is None else value)
+        if otherwise is not None and self.get(*(names or (plain(name),))) is None:
+            return otherwise
+        return number(self.path, name, self.there(name, names))
 
     def numbers(self, shown_as: str, given: object, counts: Sequence[int]) -> list[float]:
         """Return a list of numbers that is flat, in rows, or in the `data` of a matrix. Raises FileFormatError: it is
@@ -99,11 +96,6 @@ class Entries:
             wanted = " or ".join(map(str, counts))
             raise FileFormatError(f"{self.path}: {shown_as}: expected a list of {wanted} numbers, got {len(flat)}")
         return [number(self.path, shown_as, value) for value in flat]
-
-    def part(self, *names: str) -> Entries:
-        """Return the entries of an entry; none where it is not there."""
-        inner = self.get(*names)
-        return Entries(self.path, {str(key): inner[key] for key in inner} if isinstance(inner, Mapping) else {})
 
     def told(self, within: str = "") -> list[str]:
         """Return the entries that nobody asked for, as they are spelled, with a dot after the entry that they are
@@ -131,7 +123,6 @@ def nothing(value: object) -> bool:
 
 
 def _float(given: object) -> float:
-    """A number or a text as a float; NaN for what is none."""
     try:
         return float(given) if isinstance(given, (int, float, str)) and not isinstance(given, bool) else math.nan
     except (ValueError, OverflowError):
@@ -153,17 +144,18 @@ def number(path: str, name: str, given: object) -> float:
 
 def with_told(model: CameraModel, left: Sequence[str], rectified: Sequence[str] = ()) -> CameraModel:
     """The model with notes that name what was not read: of the camera, and about rectified pictures."""
-    names = ", ".join(map(shown, left[:12])) + (", ..." if len(left) > 12 else "")
-    told = [f"{model.name}: not read: {names}."] if left else []
+    unread = [", ".join(map(shown, left[:12])) + (", ..." if len(left) > 12 else "") + "."] if left else []
     if rectified:
         whose = "which are made of the camera's own ones; these are its own."
-        told.append(f"{model.name}: not read: {' and '.join(rectified)}, about rectified pictures, {whose}")
-    return replace(model, told=tuple(told))
+        unread.append(f"{' and '.join(rectified)}, about rectified pictures, {whose}")
+    return replace(model, told=tuple(f"{model.name}: not read: {what}" for what in unread))
 
 
-def made(spec: str, kind: str, size: tuple[float, float], found: Mapping[str, float]) -> CameraModel:
-    """The model of numbers in pixels, from the corner of the picture. Raises FileFormatError: numbers that no camera
-    has."""
+def made(
+    spec: str, kind: str, size: tuple[float, float], found: Mapping[str, float], first: float = 0.0
+) -> CameraModel:
+    """The model of numbers in pixels, whose origin lies at `first` to the right of and below the picture's corner.
+    Raises FileFormatError: numbers that no camera has."""
     path = spec.partition("#")[0]
     height, width = size
     if not all(side == int(side) and 1 <= side <= MOST_PIXELS for side in size):
@@ -171,7 +163,8 @@ def made(spec: str, kind: str, size: tuple[float, float], found: Mapping[str, fl
         raise FileFormatError(f"{path}: expected {wanted}, got {width:g} x {height:g}")
     if kind == EQUIRECTANGULAR:
         found = {"fx": width, "fy": height, "cx": width / 2.0, "cy": height / 2.0}
-    value = {name: found.get(name, 0.0) for name in ("fx", "fy", "cx", "cy", "skew", *COEFFICIENTS)}
+    value = {name: found.get(name, 0.0) for name in NUMBERS}
+    value["cx"], value["cy"] = value["cx"] + first, value["cy"] + first
 
     def check(name: str, fits: bool, wanted: str, hint: str = "") -> None:
         if not fits:
@@ -198,24 +191,15 @@ def made(spec: str, kind: str, size: tuple[float, float], found: Mapping[str, fl
 
 @dataclass(frozen=True)
 class CameraPreset:
-    """How a mounted camera stands, and what the control `camera` searches of it.
+    """How a mounted camera stands, and what the control `camera` searches of it."""
 
-    Attributes:
-        height: of the lens above the floor or the road, metres.
-        fov: field of view along the larger side of the picture, degrees.
-        distance: from the object's middle, metres; further where the object would not fit.
-        azimuth: where it stands around the object, degrees: before what faces it, and behind a vehicle of the road;
-            None for the scene's own.
-        aside: how far to either side of it a search goes, degrees; 180 for all around.
-        search: the other ranges that are searched by default, by parameter; what has none stays.
-    """
-
-    height: float
-    fov: float
-    distance: float
+    height: float  # of the lens above the floor or the road, metres
+    fov: float  # field of view along the larger side of the picture, degrees
+    distance: float  # from the object's middle, metres; further where the object would not fit
+    # degrees around the object: before what faces it, and behind a vehicle of the road; None for the scene's own
     azimuth: float | None
-    aside: float
-    search: Mapping[str, tuple[float, float]]
+    aside: float  # how far to either side of it a search goes, degrees; 180 for all around
+    search: Mapping[str, tuple[float, float]]  # the other ranges that are searched by default; what has none stays
 
 
 PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
@@ -238,5 +222,4 @@ PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
 TABLE, TABLE_SIDE = 0.75, 1.2
 """Height and side in metres of a table, on which the objects of a bundled room stand that are no larger than
 `ON_TABLES`."""
-ON_TABLES = 0.5
-"""Metres of the longest side."""
+ON_TABLES = 0.5  # metres of the longest side

@@ -57,7 +57,7 @@ DISTORTION = (
 )
 WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 SIZE = ("imagesize", "resolution")
-GROUPS = ("projection_parameters", "distortion_parameters", "mirror_parameters")
+GROUPS = ("projection_parameters", "distortion_parameters", "mirror_parameters")  # of camodocal (VINS)
 KANNALA = {"mu": "fx", "mv": "fy", "u0": "cx", "v0": "cy", "k2": "k1", "k3": "k2", "k4": "k3", "k5": "k4"}
 """What camodocal calls the numbers of a fisheye, and OpenCV."""
 ALIKE = 0.01  # by what share a focal length may differ from what an angle says
@@ -97,16 +97,21 @@ def read_camera(spec: str) -> CameraModel:
         raise FileFormatError(f"{path}: {wanted}, got one; leave #{which} out")
     if "intrinsics" in data and "camera_model" in data:
         return _of_kalibr(spec, Entries(path, data))
-    return _of_opencv(spec, Entries(path, _of_camodocal(data)))
+    groups = {name: group for name in GROUPS if isinstance(group := data.get(name), dict)}
+    flat = {name: value for name, value in data.items() if name not in groups}
+    for group in groups.values():
+        names = KANNALA if "mu" in group else {}
+        flat |= {names.get(str(key), str(key)): value for key, value in group.items()}
+    return _of_opencv(spec, Entries(path, flat))
 
 
 def _data(path: str, text: str) -> dict[str, Any]:
-    """The entries of a text in XML, JSON or YAML, also as OpenCV writes that: with a directive and tags of its own."""
     if text.lstrip().startswith("<"):
         return _xml(path, text)
     if path.lower().endswith(".json"):
         data = read_json(path, text)
     else:
+        # OpenCV's has a directive and tags of its own
         text = re.sub(r"!!opencv-(nd-)?matrix", "", re.sub(r"\A%YAML[^\n]*\n", "", text))
         text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
         try:
@@ -197,7 +202,6 @@ def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> Camera
 
 
 def _of_nerfstudio(spec: str, which: str, data: Mapping[str, Any]) -> CameraModel:
-    """A transforms.json of nerfstudio or Instant NGP; of several cameras in its frames the one with that number."""
     path, frames = spec.partition("#")[0], data.get("frames") or []
     frames = [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
     lenses = [{key: frame[key] for key in frame if key in OF_A_FRAME} for frame in frames] or [{}]
@@ -232,7 +236,6 @@ def _of_nerfstudio(spec: str, which: str, data: Mapping[str, Any]) -> CameraMode
 
 
 def _of_kalibr(spec: str, entries: Entries, beside: Sequence[str] = ()) -> CameraModel:
-    """Kalibr's and EuRoC's; `beside` are other entries of the file."""
     path = entries.path
     model = str(entries.get("cameramodel") or "pinhole")
     if model != "pinhole":
@@ -246,7 +249,7 @@ def _of_kalibr(spec: str, entries: Entries, beside: Sequence[str] = ()) -> Camer
     width, height = entries.numbers("resolution", entries.there("resolution"), (2,))
     numbers = _distortion(entries, names, (0, 4))
     numbers |= zip(("fx", "fy", "cx", "cy"), focal, strict=True)
-    return with_told(made(spec, kind, (height, width), _from_corner(numbers)), [*beside, *entries.told()])
+    return with_told(made(spec, kind, (height, width), numbers, 0.5), [*beside, *entries.told()])
 
 
 def _of_opencv(spec: str, entries: Entries) -> CameraModel:
@@ -275,29 +278,13 @@ def _of_opencv(spec: str, entries: Entries) -> CameraModel:
         )
     numbers |= {"fx": matrix[0], "skew": matrix[1], "cx": matrix[2], "fy": matrix[4], "cy": matrix[5]}
     (height, width), (down, across) = size, _binning(entries)
-    model = made(spec, kind, (height - height % down, width - width % across), _from_corner(numbers))
+    model = made(spec, kind, (height - height % down, width - width % across), numbers, 0.5)
     model = replace(model, size=(int(height // down), int(width // across)))
     rectified = _rectified(entries, matrix)
     return with_told(model, unread + entries.told(), rectified)
 
 
-def _of_camodocal(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Entries without the groups that camodocal (VINS) has, and with OpenCV's names for its fisheye's numbers."""
-    groups = {name: group for name in GROUPS if isinstance(group := data.get(name), dict)}
-    flat = {name: value for name, value in data.items() if name not in groups}
-    for group in groups.values():
-        names = KANNALA if "mu" in group else {}
-        flat |= {names.get(str(key), str(key)): value for key, value in group.items()}
-    return flat
-
-
-def _from_corner(numbers: dict[str, float]) -> dict[str, float]:
-    """The principal point from the corner of the picture, where it is given from the centre of the first pixel."""
-    return {**numbers, "cx": numbers["cx"] + 0.5, "cy": numbers["cy"] + 0.5}
-
-
 def _distortion(entries: Entries, names: Sequence[str], counts: Sequence[int]) -> dict[str, float]:
-    """The coefficients of a list, or where there is none, those that have entries of their own."""
     listed = entries.get(*DISTORTION)
     if nothing(listed) and not isinstance(listed, Mapping):
         coefficients = _coefficients(entries, names)
@@ -311,7 +298,6 @@ def _distortion(entries: Entries, names: Sequence[str], counts: Sequence[int]) -
 
 
 def _matrix(entries: Entries) -> list[float]:
-    """The camera matrix, row by row, also of its numbers one by one."""
     given = entries.get(*MATRIX)
     if given is None and entries.get("fx") is not None:
         fx, fy, cx, cy = (entries.number(name) for name in ("fx", "fy", "cx", "cy"))
@@ -324,7 +310,6 @@ def _coefficients(entries: Entries, names: Sequence[str]) -> dict[str, float]:
 
 
 def _rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
-    """What there is about rectified pictures, which the camera's own ones are not; none where that changes nothing."""
     x, skew, cx, y, cy = (matrix[place] for place in (0, 1, 2, 4, 5))
     other = []
     for name, short, expected in (
@@ -339,8 +324,8 @@ def _rectified(entries: Entries, matrix: Sequence[float]) -> list[str]:
 
 
 def _check_roi(entries: Entries, size: tuple[float, float]) -> list[str]:
-    """Refuse a part of the picture (0, 0 and its own size are the whole); return what it says that is not read."""
-    roi = entries.part("roi")
+    given = entries.get("roi")
+    roi = Entries(entries.path, {str(key): given[key] for key in given} if isinstance(given, Mapping) else {})
     x, y, height, width = _coefficients(roi, ("x_offset", "y_offset", "height", "width")).values()
     roi.get("dorectify")
     if (x, y) != (0.0, 0.0) or (height, width) not in ((0.0, 0.0), size):
@@ -362,7 +347,6 @@ def _kind(path: str, named: object) -> str:
 
 
 def _size(entries: Entries) -> tuple[float, float]:
-    """Height and width of the pictures."""
     if (given := entries.get(*SIZE)) is not None:
         width, height = entries.numbers("image_size", given, (2,))
         return height, width
@@ -371,7 +355,7 @@ def _size(entries: Entries) -> tuple[float, float]:
 
 
 def _binning(entries: Entries) -> tuple[float, float]:
-    """Pixels, down and across, that ROS says are made into one; its calibration is for those before."""
+    # pixels that ROS says are made into one; its calibration is for those before
     down, across = (entries.number(name, 1.0) or 1.0 for name in ("binning_y", "binning_x"))
     for name, pixels in (("binning_y", down), ("binning_x", across)):
         if pixels != int(pixels) or not 1 <= pixels <= MOST_BINNED:

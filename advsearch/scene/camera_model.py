@@ -32,43 +32,29 @@ from advsearch.errors import InputError
 BROWN_CONRADY, FISHEYE, EQUIRECTANGULAR = "brown-conrady", "fisheye", "equirectangular"
 LINEAR = ("fx", "fy", "cx", "cy", "skew")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
-NUMBERS = (*LINEAR, *COEFFICIENTS)
-"""What the numbers of a model are, in their order."""
+NUMBERS = (*LINEAR, *COEFFICIENTS)  # what the numbers of a model are, in their order
 OF_KIND: Mapping[str, tuple[str, ...]] = {BROWN_CONRADY: COEFFICIENTS, FISHEYE: COEFFICIENTS[:4], EQUIRECTANGULAR: ()}
 """The coefficients that each kind of model has."""
 
-STEPS = 60
-"""Steps after which an inversion has converged or never does; nearly all take five."""
-TOLERANCE = 1e-10
-"""Distance, in focal lengths, under which an inversion has converged."""
-WIDEST = math.tan(math.radians(80.0))
-"""Tangent of the widest half angle that is framed."""
-FAR = 1e6
-"""Tangents are not looked for beyond this one."""
+STEPS = 60  # steps after which an inversion has converged or never does; nearly all take five
+TOLERANCE = 1e-10  # distance, in focal lengths, under which an inversion has converged
+WIDEST = math.tan(math.radians(80.0))  # tangent of the widest half angle that is framed
+FAR = 1e6  # tangents are not looked for beyond this one
 
 Field = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
 class CameraModel:
-    """Intrinsics and distortion of a camera.
+    """Intrinsics and distortion of a camera."""
 
-    Attributes:
-        kind: `BROWN_CONRADY`, `FISHEYE` or `EQUIRECTANGULAR`.
-        numbers: (17,) in the order of `NUMBERS`: fx, cx and skew in picture widths, fy and cy in picture heights, and
-            the coefficients.
-        name: how it was asked for: a file, or a bundled one; empty where `camera.fov` says its focal length.
-        size: (height, width) in pixels that it was calibrated for; None for any.
-        reach: largest angle to the axis that it sees, degrees.
-        told: sentences about how its file was read.
-    """
-
-    kind: str
+    kind: str  # `BROWN_CONRADY`, `FISHEYE` or `EQUIRECTANGULAR`
+    # (17,) in the order of `NUMBERS`: fx, cx and skew in picture widths, fy and cy in picture heights, the coefficients
     numbers: tuple[float, ...]
-    name: str = ""
-    size: tuple[int, int] | None = None
-    reach: float = 180.0
-    told: tuple[str, ...] = ()
+    name: str = ""  # how it was asked for: a file, or a bundled one; empty where `camera.fov` says its focal length
+    size: tuple[int, int] | None = None  # (height, width) in pixels that it was calibrated for; None for any
+    reach: float = 180.0  # largest angle to the axis that it sees, degrees
+    told: tuple[str, ...] = ()  # sentences about how its file was read
 
     @property
     def values(self) -> dict[str, float]:
@@ -80,11 +66,8 @@ class CameraModel:
         return replace(self, numbers=tuple(numbers.double().tolist()))
 
     def check_given(self, given: Iterable[str]) -> None:
-        """Check that nobody asks for the field of view of a camera that has focal lengths of its own.
-
-        Raises:
-            InputError: it is among the settings that are given.
-        """
+        """Check that nobody asks for the field of view of a camera that has focal lengths of its own. Raises
+        InputError: it is among the settings that are given."""
         if "camera.fov" in given:
             raise InputError(
                 f"`camera={self.name}` and `set` camera.fov contradict each other: the camera has focal lengths of its "
@@ -94,10 +77,8 @@ class CameraModel:
     # ---- both ways --------------------------------------------------------------------------------------------------
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return where points (N, 3) are seen, (N, 2) in picture widths and heights, and which are, (N,) bool.
-
-        One may be seen outside of the picture. What is behind a lens, or beyond the angle at which it folds, is not.
-        """
+        """Return where points (N, 3) are seen, (N, 2) in picture widths and heights, and which are, (N,) bool. One may
+        be seen outside of the picture. What is behind a lens, or beyond the angle at which it folds, is not."""
         x, y, z = points.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
             longitude, latitude = torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))
@@ -207,10 +188,8 @@ class CameraModel:
 
     @cached_property
     def fold(self) -> float:
-        """Angle to the axis, radians, at which the radial distortion turns back; infinite if it never does.
-
-        Beyond it two directions are seen in one place, so that no picture tells them apart.
-        """
+        """Angle to the axis, radians, at which the radial distortion turns back; infinite if it never does. Beyond it
+        two directions are seen in one place, so that no picture tells them apart."""
         over, under = self._polynomials
         square = np.array([0.0, 2.0])
         slope = polynomial.polysub(
@@ -240,7 +219,6 @@ class CameraModel:
         return radius * self._scale(radius * radius)
 
     def _bent(self, flat: Tensor) -> Tensor:
-        """Where tangents (N, 2) lie after the distortion."""
         return flat * self._scale(flat.square().sum(dim=-1))[..., None] + self._decentred(flat)
 
     def _decentred(self, flat: Tensor) -> Tensor:
@@ -269,7 +247,6 @@ class CameraModel:
         return share * edges[0], share * edges[1]
 
     def _half_widths(self) -> tuple[float, float]:
-        """The tangents at which the picture ends to the nearer side, along its row and its column through the axis."""
         middle, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
         widths = []
         for axis in (0, 1):
@@ -336,7 +313,6 @@ def bundled(aspect: float = 1.0) -> Mapping[str, CameraModel]:
 
 
 def _positive_roots(coefficients: np.ndarray) -> np.ndarray:
-    """The real positive roots of a polynomial, lowest power first."""
     trimmed = polynomial.polytrim(np.asarray(coefficients, dtype=np.float64))
     roots = polynomial.polyroots(trimmed) if len(trimmed) > 1 else np.zeros(0)
     real = roots.real[np.abs(roots.imag) <= 1e-9 * np.abs(roots)]

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 
 Values = TypeVar("Values", Floats, "Tensor")
 
-LOW_END = 0.0031308
-"""Linear values up to which the encoding is straight."""
+LOW_END = 0.0031308  # linear values up to which the encoding is straight
 
 
 def srgb_to_linear(display: Values) -> Values:

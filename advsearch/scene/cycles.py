@@ -31,12 +31,9 @@ from advsearch.scene.grounds import paved
 from advsearch.scene.importing.blender import command, last_line, surroundings
 from advsearch.scene.parts import BallLamp, MeshPart, PointLamp
 
-LONGEST = 300
-"""Seconds that one picture may take, the start included, before `advsearch.files.scaled`."""
-MATT = Material(roughness=1.0, metallic=0.0, specular=0.0)
-"""Of the ground."""
-PAUSE = 0.02
-"""Seconds between looks at whether a picture is there."""
+LONGEST = 300  # seconds that one picture may take, the start included, before `advsearch.files.scaled`
+MATT = Material(roughness=1.0, metallic=0.0, specular=0.0)  # of the ground
+PAUSE = 0.02  # seconds between looks at whether a picture is there
 
 RENDER = """
 import json, math, os, sys
@@ -127,11 +124,8 @@ class BlenderError(AdvsearchError):
 
 class Cycles:
     """Renders the configurations of one scene at a resolution (height, width) by Cycles, with light paths of at most so
-    many segments, and with Blender's Open Image Denoise or without.
-
-    Raises:
-        BlenderError: there is no Blender, or the scene has what is not carried over.
-    """
+    many segments, and with Blender's Open Image Denoise or without. Raises BlenderError: there is no Blender, or the
+    scene has what is not carried over."""
 
     def __init__(
         self, description: SceneDescription, resolution: tuple[int, int], *, max_depth: int, denoise: bool
@@ -153,11 +147,8 @@ class Cycles:
         self._process: _Process | None = None
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Render linear radiance (H, W, 3); arguments as for `MitsubaScene.radiance`.
-
-        Raises:
-            BlenderError: Blender stopped, or took too long.
-        """
+        """Render linear radiance (H, W, 3); arguments as for `MitsubaScene.radiance`. Raises BlenderError: Blender
+        stopped, or took too long."""
         held = self._held
         same = self._process is not None and held.keys() == inputs.keys()
         if self._process is None or not (same and all(torch.equal(held[name], inputs[name]) for name in inputs)):
@@ -167,7 +158,6 @@ class Cycles:
         return self._process.picture(seed, spp)
 
     def _told(self, inputs: Mapping[str, Tensor]) -> tuple[dict[str, object], bytes, np.ndarray | None]:
-        """What Blender is told beside the meshes, the meshes, and the environment's map."""
         scene, (height, width) = self._description, self._resolution
         values = {name: value.detach().cpu() for name, value in inputs.items()}
         meshes = [posed(part, values) for part in scene.meshes.values()]
@@ -210,7 +200,6 @@ class Cycles:
 
 
 def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[Shape]:
-    """The ground as a mesh; none where there is none."""
     photograph = scene.photograph
     if photograph is not None:
         shown = photograph.base if reflectance is None else reflectance
@@ -277,7 +266,6 @@ class _Process:
 
 
 def _end(process: subprocess.Popen[bytes], keeper: tempfile.TemporaryDirectory[str]) -> None:
-    """Let Blender end, by force if it does not, and remove its folder."""
     process.kill()
     process.wait()
     if process.stdin is not None:

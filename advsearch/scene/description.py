@@ -14,7 +14,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from advsearch.errors import InputError, UnknownNameError
@@ -25,7 +24,15 @@ from advsearch.scene.camera_entries import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
 from advsearch.scene.formation import metered_gain
-from advsearch.scene.geometry import camera_to_world, driving, framing_distance, moved_part, object_to_world, seated
+from advsearch.scene.geometry import (
+    camera_to_world,
+    driving,
+    framing_distance,
+    moved_part,
+    object_to_world,
+    seated,
+    standing,
+)
 from advsearch.scene.grounds import Photograph, on_its_ground, paved, photograph_of
 from advsearch.scene.headlamps import with_lamps
 from advsearch.scene.importing.objects import import_object
@@ -48,77 +55,45 @@ from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.things import ThingPart, with_things
 
 DEFAULT_ENVIRONMENT = "studio"
-OBJECT = "object"
-"""The name of the mesh under test."""
-ENVIRONMENT = "environment"
-"""What stands for the environment among the settings that were asked for."""
+OBJECT = "object"  # the name of the mesh under test
+ENVIRONMENT = "environment"  # what stands for the environment among the settings that were asked for
 ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
 """Mitsuba's lights from everywhere, of which a scene can have one."""
-NO_MAP = "none"
-"""What the environment of a scene without a map is called."""
-OWN_MAP = "own"
-"""What the scene's own environment is called where another may be chosen."""
+NO_MAP = "none"  # what the environment of a scene without a map is called
+OWN_MAP = "own"  # what the scene's own environment is called where another may be chosen
 
 
 @dataclass(frozen=True, eq=False)
 class SceneDescription:
-    """Everything that fixes a scene except what a control varies.
+    """Everything that fixes a scene except what a control varies."""
 
-    Attributes:
-        object: the thing to recognise.
-        environment: the map that lights it; None where only lamps do.
-        values: every setting of `advsearch.scene.settings` by name; None where the scene works the value out. Those of
-            meshes around the object, `pose:chair.yaw`, only where they were given.
-        object_spec: how the object was asked for: a bundled name, a path, or an asset's own name.
-        environment_spec: how the environment was asked for, likewise.
-        up: the up axis that was given for a mesh file, or None.
-        size: the object's longest side in metres that was given, or None.
-        unit: of the object's file, that was given (`advsearch.scene.assets.UNITS`), or None.
-        given: what was asked for: names of settings, and "environment".
-        parts: what is in the scene beside the object, the environment and the ground: further meshes, lamps, haze.
-        thin_lens: the camera has an aperture and a focus distance.
-        backdrop: the environment may be hidden behind a plain colour (`backdrop.color`).
-        aspect: width over height of the picture.
-        cameras: those with poses of their own, by name.
-        camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
-        preset: name of the mounted camera that it is (`advsearch.scene.camera_entries`); "" for none.
-        camera_model: intrinsics and distortion of the camera around the object; None for a pinhole.
-        rig: the cameras that take pictures at the same time, the first of them this one; empty where it is alone.
-        rig_spec: how they were asked for.
-        metered: exposure is metered; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it.
-        remarks: what a user should know of further files that controls have read, and of things in each other.
-        things_spec: how the things beside the object were asked for.
-    """
-
-    object: ObjectAsset
-    environment: EnvironmentAsset | None
+    object: ObjectAsset  # the thing to recognise
+    environment: EnvironmentAsset | None  # the map that lights it; None where only lamps do
+    # every setting of `advsearch.scene.settings` by name; None where the scene works the value out. Those of meshes
+    # around the object, `pose:chair.yaw`, only where they were given
     values: Mapping[str, float | None] = field(default_factory=dict)
-    object_spec: str = ""
-    environment_spec: str = ""
-    up: str | None = None
-    size: float | None = None
-    unit: str | None = None
-    given: frozenset[str] = frozenset()
-    parts: tuple[ScenePart, ...] = ()
-    thin_lens: bool = False
-    backdrop: bool = False
-    aspect: float = 1.0
-    cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
-    camera: str = ORBIT_CAMERA
-    preset: str = ""
-    camera_model: CameraModel | None = None
-    rig: tuple[Mount, ...] = ()
-    rig_spec: str = ""
-    metered: bool = True
-    remarks: tuple[str, ...] = ()
-    things_spec: str = ""
+    object_spec: str = ""  # how the object was asked for: a bundled name, a path, or an asset's own name
+    environment_spec: str = ""  # how the environment was asked for, likewise
+    up: str | None = None  # the up axis that was given for a mesh file
+    size: float | None = None  # the object's longest side in metres that was given
+    unit: str | None = None  # of the object's file, that was given (`advsearch.scene.assets.UNITS`)
+    given: frozenset[str] = frozenset()  # what was asked for: names of settings, and "environment"
+    parts: tuple[ScenePart, ...] = ()  # beside object, environment and ground: further meshes, lamps, haze
+    thin_lens: bool = False  # the camera has an aperture and a focus distance
+    backdrop: bool = False  # the environment may be hidden behind a plain colour (`backdrop.color`)
+    aspect: float = 1.0  # width over height of the picture
+    cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)  # those with poses of their own, by name
+    camera: str = ORBIT_CAMERA  # name of the one in use; `ORBIT_CAMERA` for that of the settings
+    preset: str = ""  # name of the mounted camera that it is (`advsearch.scene.camera_entries`); "" for none
+    camera_model: CameraModel | None = None  # of the camera around the object; None for a pinhole
+    rig: tuple[Mount, ...] = ()  # cameras that take pictures at the same time, this one first; empty where it is alone
+    rig_spec: str = ""  # how they were asked for
+    metered: bool = True  # exposure is; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it
+    remarks: tuple[str, ...] = ()  # for users: of further files that controls have read, of things in each other
+    things_spec: str = ""  # how the things beside the object were asked for
 
     def with_part(self, part: ScenePart) -> SceneDescription:
-        """Return the scene with one more part.
-
-        Raises:
-            InputError: its name is taken.
-        """
+        """Return the scene with one more part. Raises InputError: its name is taken."""
         taken = {own.name: own for own in self.parts}
         if part.name in (OBJECT, "environment", "ground", "camera", *taken):
             plugin = isinstance(taken.get(part.name), PluginPart)
@@ -135,13 +110,9 @@ class SceneDescription:
 
     def seen_by(self, camera: str) -> SceneDescription:
         """Return the scene as one of its cameras sees it, or as the camera around the object does with another lens: by
-        a path to a camera file, the name of a bundled camera model, or that of a mounted camera.
-
-        Raises:
-            UnknownNameError: it has no such camera.
-            InputError: a setting of the camera around the object was given, and another is to see it; or a file cannot
-                be used.
-        """
+        a path to a camera file, the name of a bundled camera model, or that of a mounted camera. Raises
+        UnknownNameError: it has no such camera. Raises InputError: a setting of the camera around the object was given,
+        and another is to see it; or a file cannot be used."""
         if camera in PRESETS and camera not in self.cameras:
             return self._mounted(camera)
         if camera not in (ORBIT_CAMERA, *self.cameras):
@@ -155,14 +126,14 @@ class SceneDescription:
         return replace(self, camera=camera, camera_model=None)
 
     def _mounted(self, name: str) -> SceneDescription:
-        preset = PRESETS[name]
+        preset, own = PRESETS[name], {"camera.fov": PRESETS[name].fov}
         if self.object.metres is None:
             raise InputError(
                 f"`camera={name}` is {preset.height:g} m high, and how large {self.object.name} is is not known; give "
                 "its longest side in metres, such as `size=0.1`"
             )
-        on_table = self.on_table and self.object.metres <= ON_TABLES
-        own = {"camera.fov": preset.fov}
+        on_plane = self.number("ground.size") > 0.0 and self.photograph is None and not paved(self)
+        on_table = on_plane and self.object.metres <= ON_TABLES
         if "camera.elevation" not in self.given:
             own["camera.height"] = preset.height - (TABLE if on_table or FLOOR in self.around else 0.0)
         if preset.azimuth is not None:
@@ -178,23 +149,20 @@ class SceneDescription:
         return seen.with_values(camera__distance=max(preset.distance, fitted))
 
     def _with_model(self, name: str) -> SceneDescription:
-        if is_path(name) and (rig := read_rig(name)):
-            model, fov = rig[0].model, rig[0].fov
-            if model is not None:
-                model.check_given(self.given)
-            values = {**self.values, **({} if fov is None else {"camera.fov": fov})}
-            seen = replace(self, camera=ORBIT_CAMERA, camera_model=model, values=values)
-            return replace(seen, rig=rig, rig_spec=name)
-        if is_path(name):
-            with reading(name.partition("#")[0]):
-                model = read_camera(name)
-        elif name in bundled():
-            model = bundled()[name]
-        else:
+        if not is_path(name) and name not in bundled():
             known = (ORBIT_CAMERA, *self.cameras, *bundled(), *PRESETS)
             raise UnknownNameError("camera", name, known, "Or give the path of a camera file, such as calib.yaml.")
-        model.check_given(self.given)
-        return replace(self, camera=ORBIT_CAMERA, camera_model=model)
+        seen, model = replace(self, camera=ORBIT_CAMERA), bundled().get(name)
+        if is_path(name) and (rig := read_rig(name)):
+            model, fov = rig[0].model, rig[0].fov
+            seen = replace(seen, rig=rig, rig_spec=name)
+            seen = seen if fov is None else seen.with_values(camera__fov=fov)
+        elif is_path(name):
+            with reading(name.partition("#")[0]):
+                model = read_camera(name)
+        if model is not None:
+            model.check_given(self.given)
+        return replace(seen, camera_model=model)
 
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
@@ -225,7 +193,6 @@ class SceneDescription:
         return any(mesh.normal_map is not None for mesh in self.meshes.values()) or self._has("normalmap", "bumpmap")
 
     def _has(self, *kinds: str) -> bool:
-        """Whether a surface in Mitsuba's words has a plugin of these."""
         surfaces = [mesh.surface for mesh in self.meshes.values() if mesh.surface is not None]
         plugins = [part.plugin for part in self.parts if isinstance(part, PluginPart)]
         return any(inner.get("type") in kinds for plugin in (*surfaces, *plugins) for inner in plugins_in(plugin))
@@ -287,11 +254,7 @@ class SceneDescription:
         return own.name if own is not None and own.source == library.BUNDLED_ENVIRONMENT else None
 
     def environment_for(self, who: str) -> EnvironmentAsset:
-        """Return the environment for what cannot do without a map.
-
-        Raises:
-            InputError: the scene has none.
-        """
+        """Return the environment for what cannot do without a map. Raises InputError: the scene has none."""
         if self.environment is None:
             check_one_environment(self.parts, who)
             raise InputError(f"{who}: the scene has no environment map; give it one, or leave {who} out")
@@ -300,8 +263,7 @@ class SceneDescription:
     @property
     def base_vertices(self) -> Doubles:
         """(V, 3) the object's vertices in world space, in its base pose."""
-        matrix = object_to_world(self)
-        return np.asarray(self.object.mesh.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3])
+        return standing(self.meshes[OBJECT])
 
     def number(self, name: str) -> float:
         """Return a setting that always has a value; of the field of view, that of the camera in use."""
@@ -324,11 +286,9 @@ class SceneDescription:
 
     @property
     def photograph(self) -> Photograph | None:
-        """The ground that shows the environment's photograph; None where it is a table, or nothing.
-
-        Where `ground.kind` is not given, it does so for a photographed environment, unless a table is described or the
-        environment may be hidden behind a colour, which would hide everything above the horizon alone.
-        """
+        """The ground that shows the environment's photograph; None where it is a table, or nothing. Where `ground.kind`
+        is not given, it does so for a photographed environment, unless a table is described or the environment may be
+        hidden behind a colour, which would hide everything above the horizon alone."""
         own, kind = self.environment, self.values.get("ground.kind")
         if own is None or self.number("ground.size") == 0.0:
             return None
@@ -345,11 +305,6 @@ class SceneDescription:
         if height is None and self.object.metres is None:
             return settings.PHOTOGRAPHED_FROM
         return (TRIPOD if height is None else height) / self.metres
-
-    @property
-    def on_table(self) -> bool:
-        """Whether the object stands on a table, as it does in bundled rooms."""
-        return self.number("ground.size") > 0.0 and self.photograph is None and not paved(self)
 
     @property
     def ground_color(self) -> tuple[float, ...]:
@@ -432,9 +387,16 @@ def describe(
         check_one_environment(around.surroundings, f"`environment={_spec(lit_by)}`")
     if (node is not None or mitsuba) and not {"ground.size", "ground.kind"} & set(given):
         values["ground.size"] = 0.0
+    if isinstance(lit_by, EnvironmentAsset) or lit_by == NO_MAP:
+        environment = lit_by if isinstance(lit_by, EnvironmentAsset) else None
+    elif is_path(lit_by):
+        with reading(lit_by):
+            environment = library.import_environment(Path(lit_by))
+    else:
+        environment = library.load_environment(str(lit_by))
     orbits = any(name.startswith("camera.") and name != "camera.exposure" for name in given)
     described = SceneDescription(
-        around.object, _environment(lit_by), values, _spec(object_spec), _spec(lit_by), up, size, unit,
+        around.object, environment, values, _spec(object_spec), _spec(lit_by), up, size, unit,
         given=frozenset(given) | (frozenset() if environment_spec is None else {ENVIRONMENT}),
         parts=around.surroundings,
         cameras=around.cameras,
@@ -451,11 +413,7 @@ def describe(
 
 
 def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
-    """Check that a scene has the meshes whose settings are named.
-
-    Raises:
-        UnknownNameError: it has not.
-    """
+    """Check that a scene has the meshes whose settings are named. Raises UnknownNameError: it has not."""
     for name in names:
         mesh = settings.mesh_of(name)
         if mesh is not None and mesh not in scene.around:
@@ -464,11 +422,7 @@ def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
 
 def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:
     """Refuse an environment, or what needs one that is a map of ours, asked for by `who`, as it is written, beside one
-    that a Mitsuba scene has of its own among its parts.
-
-    Raises:
-        InputError: there are two.
-    """
+    that a Mitsuba scene has of its own among its parts. Raises InputError: there are two."""
     for part in parts:
         if isinstance(part, PluginPart) and part.plugin.get("type") in ENVIRONMENTS:
             raise InputError(
@@ -478,11 +432,8 @@ def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:
 
 
 def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -> None:
-    """Refuse what contradicts a ground that shows the environment's photograph.
-
-    Raises:
-        InputError: there is no photograph, or a table is described beside it.
-    """
+    """Refuse what contradicts a ground that shows the environment's photograph. Raises InputError: there is no
+    photograph, or a table is described beside it."""
     kind = given.get("ground.kind")
     if kind not in (settings.PHOTOGRAPH, *settings.ROADS, *settings.PLACES):
         return
@@ -513,15 +464,6 @@ def _object(spec: str | Path | ObjectAsset, up: str | None) -> ObjectAsset:
             f"up: bundled objects stand upright already; leave `up` out, or give a file instead of {spec!r}"
         )
     return library.load_object(str(spec))
-
-
-def _environment(spec: str | Path | EnvironmentAsset) -> EnvironmentAsset | None:
-    if isinstance(spec, EnvironmentAsset) or spec == NO_MAP:
-        return spec if isinstance(spec, EnvironmentAsset) else None
-    if is_path(spec):
-        with reading(spec):
-            return library.import_environment(Path(spec))
-    return library.load_environment(str(spec))
 
 
 def is_path(spec: str | Path) -> bool:

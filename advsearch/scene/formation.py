@@ -33,50 +33,39 @@ if TYPE_CHECKING:
 
 DENOISERS = ("oidn", "none")
 FILTERS = ("box", "gaussian")
-SAMPLERS = ("independent", "multijitter")
-"""Samplers of a run's image formation; `advsearch precision` compares more."""
-SAMPLER = "multijitter"
-"""The one that is taken where nobody asks: its pictures are as good with a third of the samples."""
+SAMPLERS = ("independent", "multijitter")  # samplers of a run's image formation; `advsearch precision` compares more
+SAMPLER = "multijitter"  # the one that is taken where nobody asks: its pictures are as good with a third of the samples
 PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61, 67, 71, 73, 79, 83, 89, 97, 101)
-DARK = 1e-6
-"""Keeps the slope of a power finite in black; half of one of 255 levels comes of it."""
+DARK = 1e-6  # keeps the slope of a power finite in black; half of one of 255 levels comes of it
 
 
 @dataclass(frozen=True)
 class ImageFormation:
-    """How a picture is formed.
+    """How a picture is formed."""
 
-    Attributes:
-        denoiser: "oidn" (Intel Open Image Denoise with albedo and normals as guides) or "none".
-        filter: reconstruction filter, "box" or "gaussian"; a gaussian correlates pixels, so the denoiser refuses it.
-        sampler: how samples are spread over a pixel: "multijitter" (Kensler 2013, Correlated multi-jittered sampling),
-            or "independent", whose noise is more.
-        exposure: stops over the metered exposure; kept for the record, `gain` is what is applied.
-        resolution: (height, width) in pixels.
-        gain: factor from radiance to display-linear values.
-        transfer: "srgb"; "gamma", a power of 1/2.2 in its place; "reinhard", sRGB after x / (1 + x), which clips
-            nothing (Reinhard, Stark, Shirley and Ferwerda 2002, Photographic tone reproduction for digital images,
-            equation 3); or "linear", neither clipped nor encoded, for checks of derivatives: the mean of a noisy
-            picture after a curve is not the curve of the mean.
-        quick: whether the denoiser takes some 0.6 of its time and leaves a little more error.
-    """
-
-    denoiser: str = "oidn"
-    filter: str = "box"
+    denoiser: str = "oidn"  # or "none": Intel Open Image Denoise with albedo and normals as guides
+    filter: str = "box"  # of reconstruction, or "gaussian", which correlates pixels, so that the denoiser refuses it
+    # how samples are spread over a pixel: "multijitter" (Kensler 2013, Correlated multi-jittered sampling), or
+    # "independent", whose noise is more
     sampler: str = SAMPLER
-    exposure: float = 0.0
-    resolution: tuple[int, int] = (128, 128)
-    gain: float = 1.0
+    exposure: float = 0.0  # stops over the metered exposure; kept for the record, `gain` is what is applied
+    resolution: tuple[int, int] = (128, 128)  # (height, width) in pixels
+    gain: float = 1.0  # factor from radiance to display-linear values
+    # or "gamma", a power of 1/2.2 in its place; "reinhard", sRGB after x / (1 + x), which clips nothing (Reinhard,
+    # Stark, Shirley and Ferwerda 2002, Photographic tone reproduction for digital images, equation 3); or "linear",
+    # neither clipped nor encoded, for checks of derivatives: the mean of a noisy picture after a curve is not the curve
+    # of the mean
     transfer: str = "srgb"
-    quick: bool = False
+    quick: bool = False  # the denoiser takes some 0.6 of its time and leaves a little more error
 
     def __post_init__(self) -> None:
-        if self.denoiser not in DENOISERS:
-            raise InputError(f"denoise: expected one of {', '.join(DENOISERS)}, got {self.denoiser!r}")
-        if self.sampler not in SAMPLERS:
-            raise InputError(f"pixel_sampler: expected one of {', '.join(SAMPLERS)}, got {self.sampler!r}")
-        if self.filter not in FILTERS:
-            raise InputError(f"reconstruction filter: expected one of {', '.join(FILTERS)}, got {self.filter!r}")
+        for name, chosen, known in (
+            ("denoise", self.denoiser, DENOISERS),
+            ("pixel_sampler", self.sampler, SAMPLERS),
+            ("reconstruction filter", self.filter, FILTERS),
+        ):
+            if chosen not in known:
+                raise InputError(f"{name}: expected one of {', '.join(known)}, got {chosen!r}")
         if self.denoiser == "oidn" and self.filter != "box":
             raise InputError(
                 "the denoiser needs the box filter: any other correlates pixels; use `denoise=none` with it"
@@ -113,9 +102,8 @@ class _Shown(torch.autograd.Function):
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor, None]:
         (radiance,) = ctx.saved_tensors
         if torch.is_grad_enabled():  # somebody takes a second derivative
-            return torch.autograd.grad(linear_to_srgb(radiance * ctx.gain), radiance, cotangent, create_graph=True)[
-                0
-            ], None
+            shown = linear_to_srgb(radiance * ctx.gain)
+            return torch.autograd.grad(shown, radiance, cotangent, create_graph=True)[0], None
         linear = radiance * ctx.gain
         inside = (linear >= 0.0) & (linear <= 1.0)
         slope = linear.clamp(LOW_END, 1.0).pow_(1.0 / 2.4 - 1.0).mul_(1.0 / 2.4).mul_(cotangent * 1.055)
@@ -135,11 +123,9 @@ def to_8_bit(display: Tensor) -> Tensor:
 
 @lru_cache(maxsize=64)
 def next_count(sampler: str, samples: float) -> int:
-    """Return the number of samples that a sampler takes when it is asked for at least so many.
-
-    Independent samples come in any number; stratified ones in squares, multi-jittered ones in products of two near
-    numbers, orthogonal arrays in squares of primes, the low-discrepancy sequence in powers of four.
-    """
+    """Return the number of samples that a sampler takes when it is asked for at least so many. Independent samples come
+    in any number; stratified ones in squares, multi-jittered ones in products of two near numbers, orthogonal arrays in
+    squares of primes, the low-discrepancy sequence in powers of four."""
     whole = max(1, math.ceil(samples - 1e-9))
     root = math.isqrt(whole - 1) + 1
     if sampler == "stratified":
@@ -169,10 +155,8 @@ random numbers are the same ones, to within rounding, which `advsearch check` sh
 light are another matter (`engine.path_length`): leaving those out has a bias, so only the search does it, within a
 measured bound, and the verification renders all of them."""
 
-EVERYTHING = frozenset(ITEMS)
-"""Leave out all that can be."""
-NOTHING: frozenset[str] = frozenset()
-"""Leave out nothing: what a program has to do that knows neither scene nor search."""
+EVERYTHING = frozenset(ITEMS)  # leave out all that can be
+NOTHING: frozenset[str] = frozenset()  # leave out nothing: what a program has to do that knows neither scene nor search
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -188,16 +172,12 @@ NOTHING: frozenset[str] = frozenset()
 #
 #     E(n) = integral over directions w of L(w) max(n . w, 0),    L(w) = albedo / pi E(up) where w ends on the ground
 
-RASTER = 32
-"""Pixels along the longer side of the picture in which the surface is looked at."""
-ROWS = 32
-"""Rows to which an environment is summed up: irradiance varies slowly."""
+RASTER = 32  # pixels along the longer side of the picture in which the surface is looked at
+ROWS = 32  # rows to which an environment is summed up: irradiance varies slowly
 
 
-WHITE = 0.8
-"""Reflectance of the card that is metered."""
-METERED_WHITE = 0.5
-"""Linear display value that it gets, on average over what the camera sees of the object."""
+WHITE = 0.8  # reflectance of the card that is metered
+METERED_WHITE = 0.5  # linear display value that it gets, on average over what the camera sees of the object
 
 
 _NINTHS = [(a, b) for a in range(4) for b in range(4 - a)]
@@ -210,21 +190,13 @@ MOVED = ("camera.", "pose.", "environment.")
 
 @lru_cache(maxsize=8)
 def metered_gain(scene: SceneDescription) -> float:
-    """Return the factor on radiance with which the metered white card gets `METERED_WHITE`.
-
-    Where the camera sees nothing of the object, the card lies on the ground; where no light arrives the factor is 1.
-    """
+    """Return the factor on radiance with which the metered white card gets `METERED_WHITE`. Where the camera sees
+    nothing of the object, the card lies on the ground; where no light arrives the factor is 1."""
     default = {name: value for name, value in resolve({}).items() if name.startswith(MOVED)}
     scene = replace(scene, values={**scene.values, **default}, aspect=1.0, camera=ORBIT_CAMERA, camera_model=None)
-    seen = visible_irradiance(scene)
-    metered = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean()) if seen is None else seen
-    return METERED_WHITE * math.pi / (WHITE * metered) if metered > 0.0 else 1.0
-
-
-def visible_irradiance(scene: SceneDescription) -> float | None:
-    """Return the mean irradiance (mean channel) on what the camera sees of the object; None if it sees nothing."""
     normals = visible_normals(scene)
-    return float(irradiance(scene, normals).mean()) if len(normals) else None
+    metered = float(irradiance(scene, normals if len(normals) else np.array([[0.0, 0.0, 1.0]])).mean())
+    return METERED_WHITE * math.pi / (WHITE * metered) if metered > 0.0 else 1.0
 
 
 def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
@@ -265,9 +237,7 @@ def arriving(scene: SceneDescription) -> tuple[Doubles, Doubles, Doubles]:
 
 def _emitted(part: MeshPart, emission: Floats, place: Doubles) -> tuple[Doubles, Doubles]:
     """Return unit ways (F, 3) from a place (3,) to the faces of a mesh, and the irradiance (F, 3) where each is faced.
-
-    A face is taken for a disk of its mean radiance.
-    """
+    A face is taken for a disk of its mean radiance."""
     corners = standing(part)[part.mesh.faces]
     area = face_vectors(corners) / 2.0
     way = corners.mean(axis=1) - place
@@ -341,8 +311,7 @@ def _edges(size: int, count: int) -> Ints:
 # takes those in its own exposure.
 
 FEWEST, MOST = 8, 64
-A_PIXEL = 2
-"""Moments for each pixel that the fastest point of the picture moves while it is taken."""
+A_PIXEL = 2  # moments for each pixel that the fastest point of the picture moves while it is taken
 
 
 class Later(Protocol):

@@ -34,12 +34,10 @@ if TYPE_CHECKING:
 
 FRAME_FILL = 0.86
 """Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
-CLEARANCE = 0.02
-"""Smallest distance, in object sizes, to the sphere around the object."""
+CLEARANCE = 0.02  # smallest distance, in object sizes, to the sphere around the object
 STEEPEST = math.sin(math.radians(89.0))
 """Sine of the elevation at which a camera stays that is to be higher above the object than it is away."""
-NEAREST = 1e-3
-"""Depth up to which points have no place in the picture."""
+NEAREST = 1e-3  # depth up to which points have no place in the picture
 DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
 
 
@@ -82,7 +80,6 @@ def middle(description: SceneDescription) -> Doubles:
 
 
 def _offsets(description: SceneDescription) -> Tensor:
-    """The object's vertices (V, 3) from there."""
     return torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description))
 
 
@@ -96,17 +93,14 @@ def _edge(description: SceneDescription, fov: Tensor, aspect: float) -> Tensor:
 
 
 def _from_one_side(offsets: Tensor, axes: Doubles, tangents: Tensor) -> Tensor:
-    """The distance at which every vertex projects inside the tangents, from one direction."""
     left, up, outwards = offsets.matmul(torch.from_numpy(axes).T.to(offsets)).unbind(dim=1)
     return (outwards + torch.maximum(left.abs() / tangents[0], up.abs() / tangents[1])).max()
 
 
 def _from_all_around(offsets: Tensor, elevation: float, tangents: Tensor) -> Tensor:
-    """The distance at which every vertex projects inside the tangents, from every azimuth at one elevation.
-
-    Seen from all around, a vertex runs through a circle of radius rho at height z: what it asks for is a sine of the
-    azimuth plus a constant for each edge of the picture, whose largest value is known in closed form.
-    """
+    """The distance at which every vertex projects inside the tangents, from every azimuth at one elevation. Seen from
+    all around, a vertex runs through a circle of radius rho at height z: what it asks for is a sine of the azimuth plus
+    a constant for each edge of the picture, whose largest value is known in closed form."""
     rho, z = offsets[:, :2].norm(dim=1), offsets[:, 2]
     cosine, sine = math.cos(math.radians(elevation)), math.sin(math.radians(elevation))
     across, along = 1.0 / tangents[0], 1.0 / tangents[1]
@@ -133,9 +127,7 @@ def affine(linear: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
 
 def object_to_world(description: SceneDescription) -> Doubles:
     """Return the object's pose: scale and rotate about the middle of its bounding box, keep it on the ground, shift.
-
-    "On the ground" means that the lowest vertex is at z = 0 before `pose.z` is added, whatever the rotation.
-    """
+    "On the ground" means that the lowest vertex is at z = 0 before `pose.z` is added, whatever the rotation."""
     vertices = description.object.mesh.vertices.astype(np.float64)
     pose = {parameter.name: description.number(f"pose.{parameter.name}") for parameter in POSE}
     return _posed(vertices, 0.0, pose)
@@ -172,11 +164,9 @@ def _posed(places: Doubles, floor: float, pose: Mapping[str, float]) -> Doubles:
 
 def camera_to_world(description: SceneDescription, aspect: float | None = None) -> Doubles:
     """Return the pose of the camera in use, for a picture of an aspect (width over height; None for the description's):
-    by default on an orbit around the middle of the object, looking at it.
-
-    The camera looks along its own +z with +y up and +x to the left, as Mitsuba's sensors do. It frames the object in
-    its default pose, so that a shifted or scaled object moves in the picture.
-    """
+    by default on an orbit around the middle of the object, looking at it. The camera looks along its own +z with +y up
+    and +x to the left, as Mitsuba's sensors do. It frames the object in its default pose, so that a shifted or scaled
+    object moves in the picture."""
     if description.camera != ORBIT_CAMERA:
         return description.cameras[description.camera].to_world
     aspect = description.aspect if aspect is None else aspect
@@ -235,10 +225,8 @@ def driving(camera: Tensor) -> Tensor:
 
 @lru_cache(maxsize=4)
 def real_harmonics(height: int, width: int) -> Tensor:
-    """Return the nine real spherical harmonics of degrees 0 to 2 over a map of equal angles: (height, width, 9).
-
-    Each has root mean square 1 over the sphere (Ramamoorthi and Hanrahan 2001, section 3).
-    """
+    """Return the nine real spherical harmonics of degrees 0 to 2 over a map of equal angles: (height, width, 9). Each
+    has root mean square 1 over the sphere (Ramamoorthi and Hanrahan 2001, section 3)."""
     theta = (torch.arange(height) + 0.5) * math.pi / height
     phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
     x = theta.sin()[:, None] * phi.cos()[None]

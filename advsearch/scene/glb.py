@@ -198,7 +198,6 @@ def _levels(color: Floats) -> Levels:
 
 
 def _cut_out_png(color: Levels, opacity: Levels) -> bytes:
-    """A picture whose alpha is the opacity, at the size of the colour."""
     file, picture = io.BytesIO(), Image.fromarray(color)
     picture.putalpha(Image.fromarray(opacity).resize(picture.size, Image.Resampling.BILINEAR))
     picture.save(file, "PNG")

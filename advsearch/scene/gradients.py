@@ -18,8 +18,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
 
-BY_DIFFERENCES = frozenset({"differences", "secant"})
-"""Estimators that take primal renders."""
+BY_DIFFERENCES = frozenset({"differences", "secant"})  # estimators that take primal renders
 
 
 @dataclass(frozen=True)
@@ -36,43 +35,23 @@ WHOLE_RANGE = Budget("box", None)
 
 @dataclass(frozen=True)
 class Group:
-    """Neighbouring coordinates with one budget and one way to be differentiated.
+    """Neighbouring coordinates with one budget and one way to be differentiated. A control says the first seven; the
+    space in which it lies, whose it is and where it begins; a `GradientPlan`, how it is differentiated."""
 
-    A control says the first seven; the space in which it lies, whose it is and where it begins; a `GradientPlan`, how
-    it is differentiated.
-
-    Attributes:
-        parameter: name of the parameter behind them.
-        size: number of coordinates.
-        valid: the valid estimators (keys of `plan.ESTIMATORS`), preferred first; empty for a discrete choice, which has
-            no derivative.
-        budget: how far they may go.
-        periodic: 0 and 1 are the same value.
-        options: number of options of a discrete choice; 0 for a continuous parameter.
-        setting: name of the scene's setting that says the same; may be empty.
-        control: name of the control.
-        begin: first coordinate in u.
-        estimator: the one that is taken.
-        step: half-width of a difference in u; 0 where none is taken.
-        pixel: that half-width over which the fastest outline moves by a pixel; that of the group where nothing moves.
-        reason: why this estimator, in words.
-        measured: what a measurement found for each valid estimator: variance x time, if one was made.
-    """
-
-    parameter: str
-    size: int
-    valid: tuple[str, ...]
-    budget: Budget = WHOLE_RANGE
-    periodic: bool = False
-    options: int = 0
-    setting: str = ""
-    control: str = ""
-    begin: int = 0
-    estimator: str = "none"
-    step: float = 0.0
-    pixel: float = 0.0
-    reason: str = ""
-    measured: Mapping[str, float] = field(default_factory=dict)
+    parameter: str  # name of the parameter behind them
+    size: int  # number of coordinates
+    valid: tuple[str, ...]  # estimators, preferred first; empty for a discrete choice, which has no derivative
+    budget: Budget = WHOLE_RANGE  # how far they may go
+    periodic: bool = False  # 0 and 1 are the same value
+    options: int = 0  # number of options of a discrete choice; 0 for a continuous parameter
+    setting: str = ""  # name of the scene's setting that says the same; may be empty
+    control: str = ""  # name of the control
+    begin: int = 0  # first coordinate in u
+    estimator: str = "none"  # the one that is taken
+    step: float = 0.0  # half-width of a difference in u; 0 where none is taken
+    pixel: float = 0.0  # that over which the fastest outline moves by a pixel; that of the group where nothing moves
+    reason: str = ""  # why this estimator, in words
+    measured: Mapping[str, float] = field(default_factory=dict)  # variance x time of each valid one, where measured
 
     @property
     def coordinates(self) -> slice:
@@ -112,15 +91,13 @@ ESTIMATORS: Mapping[str, str] = {
 BY_ADJOINT = frozenset({"adjoint", "material"})
 ALWAYS_VALID = ("differences", "secant", "none")
 """Estimators that need nothing but renders, so they can be forced on any continuous coordinate."""
-MANY = 16
-"""Coordinates over which differences are not compared with an adjoint: one by one they take too many renders."""
+MANY = 16  # coordinates over which differences are not compared with an adjoint: one by one they take too many renders
 
 DEFAULT_STEP, TURN_STEP = 0.05, 0.005
 """Half of a difference's width in u, for coordinates that move nothing in the picture: of a range, of a full turn."""
 DEFAULT_PIXELS = 1.0
 """Pixels by which the fastest point of an outline moves in half a difference (docs/gradients.md, "The estimators")."""
-STEP_RANGE = (1e-6, 0.15)
-"""Smallest and largest step in u."""
+STEP_RANGE = (1e-6, 0.15)  # smallest and largest step in u
 SEARCH_STEP = 0.03
 """Smallest step in u of one number that moves outlines. Over a pixel a classifier's loss is rough: what it does over
 the 2 to 5 % of a range that a search goes at a time has another sign as often as not, and more noise hides it.
@@ -132,8 +109,7 @@ things out of sight."""
 
 STORED = ("control", "parameter", "size", "estimator", "valid", "step", "step_reason", "reason")
 """What a run stores of one group of coordinates; see `Group`."""
-CHOSEN = ("estimator", "step", "reason")
-"""What of it a plan for the same space takes over."""
+CHOSEN = ("estimator", "step", "reason")  # what of it a plan for the same space takes over
 
 
 @dataclass(frozen=True)
@@ -181,13 +157,12 @@ class GradientPlan:
 
     def restored(self, stored: Mapping[str, Any]) -> GradientPlan:
         """Return the plan with the choices that `to_dict` has stored of a plan for the same space."""
-        chosen = {f"{group['control']}.{group['parameter']}": group for group in stored["groups"]}
-
-        def choice(group: Group) -> dict[str, Any]:
-            kept = chosen[group.name]
-            return {"measured": kept["variance_x_seconds"], **{name: kept[name] for name in CHOSEN}}
-
-        return replace(self._changed(choice), spp=stored["spp"])
+        kept = {
+            f"{group['control']}.{group['parameter']}": {name: group[name] for name in CHOSEN}
+            | {"measured": group["variance_x_seconds"]}
+            for group in stored["groups"]
+        }
+        return replace(self._changed(lambda group: kept[group.name]), spp=stored["spp"])
 
     def to_dict(self) -> dict[str, Any]:
         """Return what a run stores of the plan: its renders, and `STORED` and the measurements of each group."""
@@ -228,8 +203,7 @@ def first_plan(
     names = {key for group in groups for key in (group.name, group.control)}
     for name, estimator in forced.items():
         if estimator not in ESTIMATORS:
-            what = "estimator" if name == "*" else f"estimator for {name}"
-            raise UnknownNameError(what, estimator, ESTIMATORS)
+            raise UnknownNameError("estimator" if name == "*" else f"estimator for {name}", estimator, ESTIMATORS)
     for name in forced:
         if name != "*" and name not in names:
             raise UnknownNameError("control in `estimators`", name, sorted(names))
@@ -251,9 +225,9 @@ def _first(group: Group, steps: Tensor, forced: Mapping[str, str], across: float
                 f"{', '.join(dict.fromkeys((*group.valid, *ALWAYS_VALID)))}"
             )
         return replace(group, estimator=wanted, step=step, reason="forced by name")
-    everywhere = forced.get("*")
+    everywhere = forced.get("*", "")
     if everywhere in group.valid or (everywhere in ALWAYS_VALID and "image" not in group.valid):
-        return replace(group, estimator=str(everywhere), step=step, reason="forced for all")
+        return replace(group, estimator=everywhere, step=step, reason="forced for all")
     only = len(group.valid) == 1
     reason = "the only valid estimator" if only else f"preferred among {', '.join(group.valid)}; not measured"
     return replace(group, estimator=group.valid[0], step=step, reason=reason)
@@ -265,11 +239,9 @@ Backward = Callable[[Any, Tensor], tuple[Tensor | None, ...]]
 
 
 def first_order(backward: Backward) -> Backward:
-    """Have what an autograd function's backward pass returns refuse to be differentiated again.
-
-    Torch's own `once_differentiable` refuses only where the engine runs its node: `torch.autograd.grad` and
-    `functional.hessian` leave that out, and a part of the derivative with it.
-    """
+    """Have what an autograd function's backward pass returns refuse to be differentiated again. Torch's own
+    `once_differentiable` refuses only where the engine runs its node: `torch.autograd.grad` and `functional.hessian`
+    leave that out, and a part of the derivative with it."""
 
     @wraps(backward)
     def once(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
 
-LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Shares of linear red, green and blue in luminance (Rec. ITU-R BT.709)."""
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # shares of linear red, green and blue in luminance (Rec. ITU-R BT.709)
 SECTORS = 128
 RINGS = 64
 NEAREST, FARTHEST = 0.01, 1000.0
@@ -64,9 +63,7 @@ class Photograph:
 
     def reflectance(self, radiance: Tensor) -> Tensor:
         """Return the plane's texture (h, W, 3) for a map of any size; 0 where no light comes from above.
-
-        Differentiable; row 0 is the horizon, the last one is straight down, and columns are those of the map.
-        """
+        Differentiable; row 0 is the horizon, the last one is straight down, and columns are those of the map."""
         rows = radiance.shape[0]
         at = torch.arange(self._first, self._rows, device=radiance.device) * ((rows - 1) / (self._rows - 1))
         upper = at.floor().long().clamp_max(rows - 2)
@@ -145,12 +142,10 @@ def on_its_ground(scene: SceneDescription) -> SceneDescription:
     return scene if len(others) == len(scene.parts) else replace(scene, parts=others)
 
 
-DUSK = 70.0
-"""Illuminance of the open sky at which street lamps are switched on, lux."""
+DUSK = 70.0  # illuminance of the open sky at which street lamps are switched on, lux
 
 
 def _kind(scene: SceneDescription) -> str | None:
-    """What the object stands on: as was asked, or else what belongs to the environment, unless a table is described."""
     kind = scene.values.get("ground.kind")
     if scene.number("ground.size") == 0.0:
         return None

@@ -34,12 +34,10 @@ from advsearch.scene.things import ThingPart, heights_over
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
-CUT_OFF = -0.57
-"""Degrees above the horizon at which the low beam has half of what it has below."""
+CUT_OFF = -0.57  # degrees above the horizon at which the low beam has half of what it has below
 SIDES, ROWS, COLUMNS = 1.0, 512, 896
 """Tangent of the table's angle to either side, and its size; up and down it has the same tangent a texel."""
-GLASS, REAR = 250.0, 10.0
-"""Candela ahead of the glass of one headlamp, and behind that of one tail lamp."""
+GLASS, REAR = 250.0, 10.0  # candela ahead of the glass of one headlamp, and behind that of one tail lamp
 WHITE, RED = (color / (color @ np.array(LUMINANCE)) for color in np.array([[1.0, 0.95, 0.86], [1.0, 0.0, 0.0]]))
 """Linear colours with a luminance of 1."""
 NAMED = {
@@ -54,8 +52,7 @@ SPOKES = 12
 EGO = (1.7, 0.62, 0.65)
 """Where the headlamps of the camera's own car are: metres before the camera, to either side, above the ground."""
 CLEAR = Material(roughness=0.06, specular=0.6)
-OUT = 0.004
-"""How far glass stands out from what it lies on, metres."""
+OUT = 0.004  # how far glass stands out from what it lies on, metres
 
 
 def candela(kind: str, h: Doubles, v: Doubles) -> Doubles:
@@ -82,11 +79,8 @@ def table(kind: str) -> Floats:
 
 
 def with_lamps(scene: SceneDescription) -> SceneDescription:
-    """Return the scene with the lamps that its object, its things and its camera's car have on, and no others.
-
-    Raises:
-        InputError: the light of the environment has no unit, the object's size is not known, or a name is taken.
-    """
+    """Return the scene with the lamps that its object, its things and its camera's car have on, and no others. Raises
+    InputError: the light of the environment has no unit, the object's size is not known, or a name is taken."""
     others = tuple(part for part in scene.parts if not isinstance(part, (BeamLamp, LampGlass)))
     asked = {"object": chosen(scene, "object.lamps"), CAMERA: chosen(scene, "camera.lamps")}
     asked |= {part.name: part.lamps for part in others if isinstance(part, ThingPart)}
@@ -121,7 +115,6 @@ def chosen(scene: SceneDescription, setting: str) -> str:
 
 
 def _lamps_of(scene: SceneDescription, carrier: str, kind: str, unit: float, weight: float) -> Iterable[ScenePart]:
-    """The glasses and the two headlamps of a car, in the coordinates of what carries them."""
     sides = (1.0, -1.0)
     if carrier == CAMERA:
         places = [np.array([EGO[0], side * EGO[1], EGO[2]]) / scene.metres for side in sides]
@@ -176,7 +169,6 @@ def _glass(part: MeshPart, where: str, ahead: float, step: float, power: Doubles
 
 
 def _disks(mesh: Mesh, where: str, ahead: float, step: float) -> tuple[Doubles, Ints]:
-    """Vertices (V, 3) and faces (F, 3) of two disks; arguments as of `_glass`."""
     corners = mesh.vertices[mesh.faces].astype(np.float64) * [ahead, 1.0, 1.0]
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     (height, share), wide = HEIGHTS[where], high[1] - low[1]

@@ -26,8 +26,7 @@ from advsearch.scene.importing.pictures import area_average, banded_average
 from advsearch.scene.parts import BASE_COLOR
 from advsearch.scene.raster import rasterised
 
-SIDE = 256
-"""Texels along the maps of roughness, metal and clear coat."""
+SIDE = 256  # texels along the maps of roughness, metal and clear coat
 
 
 def finished(mesh: Mesh, finishes: Mapping[str, Material], main: Material) -> dict[str, object]:
@@ -52,10 +51,8 @@ def finished(mesh: Mesh, finishes: Mapping[str, Material], main: Material) -> di
 if TYPE_CHECKING:
     from importlib.abc import Traversable
 
-BUNDLED_OBJECT = "bundled object"
-"""Source of an object that is bundled, or another member of its family."""
-BUNDLED_ENVIRONMENT = "bundled environment"
-"""Source of an environment that is bundled."""
+BUNDLED_OBJECT = "bundled object"  # source of an object that is bundled, or another member of its family
+BUNDLED_ENVIRONMENT = "bundled environment"  # source of an environment that is bundled
 _PLY = (
     rb"ply\nformat binary_little_endian 1\.0\nelement vertex (\d+)\n"
     + b"".join(rb"property float %s\n" % name.encode() for name in ("x", "y", "z", "nx", "ny", "nz", "s", "t"))
@@ -83,19 +80,14 @@ def list_environments(split: str | None = None) -> tuple[str, ...]:
 
 
 def _environments() -> dict[str, dict[str, Any]]:
-    """What is known of each bundled environment, by name."""
     text = (_data() / "environments" / "environments.json").read_text("utf-8")
     facts: dict[str, dict[str, Any]] = json.loads(text)["environments"]
     return facts
 
 
 def load_object(name: str) -> ObjectAsset:
-    """Return a bundled object, its largest extent 1, standing on z = 0.
-
-    Raises:
-        UnknownNameError: there is no such object.
-        FileFormatError: the installation is damaged.
-    """
+    """Return a bundled object, its largest extent 1, standing on z = 0. Raises UnknownNameError: there is no such
+    object. Raises FileFormatError: the installation is damaged."""
     import imageio.v3 as iio  # most scenes need no such file
 
     known = list_objects()
@@ -131,12 +123,8 @@ def load_object(name: str) -> ObjectAsset:
 
 
 def load_environment(name: str) -> EnvironmentAsset:
-    """Return a bundled environment.
-
-    Raises:
-        UnknownNameError: there is no such environment.
-        FileFormatError: the installation is damaged.
-    """
+    """Return a bundled environment. Raises UnknownNameError: there is no such environment. Raises FileFormatError: the
+    installation is damaged."""
     known = list_environments()
     if name not in known:
         raise UnknownNameError("environment", name, known, MAP_HINT)
@@ -156,10 +144,7 @@ def load_environment(name: str) -> EnvironmentAsset:
 
 def _mesh(content: bytes) -> Mesh:
     """Decode a binary PLY as `scenes/files.py` writes it: vertices, normals and texture coordinates, then triangles.
-
-    Raises:
-        ValueError: it is another PLY.
-    """
+    Raises ValueError: it is another PLY."""
     header, _, body = content.partition(b"end_header\n")
     counts = re.fullmatch(_PLY, header)
     if counts is None:
@@ -177,11 +162,9 @@ def _mesh(content: bytes) -> Mesh:
 
 # ---- Environments from pictures: ``--environment path.hdr|.exr``, equirectangular maps in linear radiance -----------
 
-SUFFIXES = (".hdr", ".exr")
-"""The pictures that can be imported."""
+SUFFIXES = (".hdr", ".exr")  # the pictures that can be imported
 
-LARGEST = (512, 1024)
-"""Rows and columns of the largest environment kept; larger ones are averaged down."""
+LARGEST = (512, 1024)  # rows and columns of the largest environment kept; larger ones are averaged down
 
 SMALLEST = (4, 8)
 """Rows and columns that a smaller environment is brought up to by repeating its texels; renderers need a few."""
@@ -198,11 +181,8 @@ class LightPicture:
 
 
 def read_light(path: Path, what: str = "environment") -> LightPicture:
-    """Read an ``.hdr`` or ``.exr`` picture of any shape.
-
-    Raises:
-        FileFormatError, InputError: as for `import_environment`.
-    """
+    """Read an ``.hdr`` or ``.exr`` picture of any shape. Raises FileFormatError, InputError: as for
+    `import_environment`."""
     data = read_bytes(path, what, SUFFIXES)
     if path.suffix.lower() == ".hdr":
         pixels, scale, notes = read_radiance(path, data)
@@ -221,11 +201,9 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     Y alone (grey), in half or float; see `advsearch.scene.importing.hdr`.
 
     Maps larger than `LARGEST` are averaged down, each texel weighted by the solid angle that it covers, so that the
-    light from each direction stays the same in the mean. Row 0 is up; columns stay in the file's order.
-
-    Raises:
-        FileFormatError: the file is missing, of another kind, damaged, or lacks channels; the message names it.
-        InputError: values that are negative, NaN or infinite; the message counts them and gives the first position.
+    light from each direction stays the same in the mean. Row 0 is up; columns stay in the file's order. Raises
+    FileFormatError: the file is missing, of another kind, damaged, or lacks channels; the message names it. Raises
+    InputError: values that are negative, NaN or infinite; the message counts them and gives the first position.
     """
     file = Path(path)
     picture = read_light(file)
@@ -240,7 +218,6 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
 
 
 def _check_values(file: Path, planes: Planes) -> None:
-    """Refuse texels that are not light."""
     kinds: tuple[tuple[str, Callable[[Plane], Bools], str], ...] = (
         ("NaN", np.isnan, "paint them over"),
         ("infinite", np.isinf, "clamp them, or save the map in 32-bit floats if half floats overflowed"),

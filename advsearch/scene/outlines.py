@@ -19,29 +19,19 @@ from advsearch.scene.geometry import camera_to_world, projected
 from advsearch.scene.raster import pixels_in
 from advsearch.scene.renderer import Renderer
 
-RASTER = 2048
-"""Most pixels along a side of an outline; of a larger one each stands for several of the picture."""
-WITHIN = 0.98
-"""Share of the pixels that are seen which an outline has to have, give or take one, or it is not believed."""
+RASTER = 2048  # most pixels along a side of an outline; of a larger one each stands for several of the picture
+WITHIN = 0.98  # share of the pixels that are seen which an outline has to have, give or take one, or it is not believed
 
 
 @dataclass(frozen=True, eq=False)
 class SeenThing:
-    """What a picture shows of one mesh.
-
-    Attributes:
-        mask: (H, W) bool, the pixels that it is first seen in.
-        share: of its outline that these are, in (0, 1]; None where the outline is not known.
-        truncated: whether the outline goes on beyond the picture; None where it is not known.
-        distance: along the ray to its nearest point that is seen, in metres; in object sizes where its size is not
-            known.
-    """
+    """What a picture shows of one mesh."""
 
     name: str
-    mask: Bools
-    share: float | None
-    truncated: bool | None
-    distance: float
+    mask: Bools  # (H, W) the pixels that it is first seen in
+    share: float | None  # of its outline that these are, in (0, 1]; None where the outline is not known
+    truncated: bool | None  # whether the outline goes on beyond the picture; None where it is not known
+    distance: float  # along the ray to its nearest seen point, in metres; object sizes where its size is not known
 
     @property
     def box(self) -> tuple[int, int, int, int]:
@@ -67,11 +57,9 @@ def seen_things(renderer: Renderer, u: Tensor, names: Collection[str] | None = N
 def _outline(
     renderer: Renderer, description: SceneDescription, inputs: Mapping[str, Tensor], name: str, mask: Bools
 ) -> tuple[float | None, bool | None]:
-    """The share of an outline that is seen, and whether it goes on beyond the picture."""
+    # the share of an outline that is seen, and whether it goes on beyond the picture
     part, (height, width) = description.meshes[name], mask.shape
-    vertices = inputs.get(f"{name}.vertices")
-    if vertices is None:
-        vertices = renderer.scene.assembly.meshes[name].place(None, None)[0]
+    vertices = renderer.scene.assembly.vertices(name, inputs)
     camera = inputs.get("camera.to_world", torch.from_numpy(camera_to_world(description, width / height)))
     camera = camera.detach().double().cpu()
     points = (vertices.detach().double().cpu() - camera[:3, 3]) @ camera[:3, :3]

@@ -17,8 +17,7 @@ import numpy as np
 from advsearch.scene.assets import Doubles, Floats, Ints, Material, Shape
 
 Triple = tuple[float, float, float]
-BASE_COLOR = "base color"
-"""The type that stands for the texture in a surface in Mitsuba's words."""
+BASE_COLOR = "base color"  # the type that stands for the texture in a surface in Mitsuba's words
 
 
 def plugins_in(plugin: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
@@ -82,11 +81,8 @@ class _Point(ScenePart):
 
 
 class PointLamp(_Point):
-    """A point that shines equally in all directions.
-
-    Takes `NAME.position` (3,) in object sizes and `NAME.intensity` (3,) linear radiant intensity. The interior adjoint
-    is right for the intensity; for a position Mitsuba raises.
-    """
+    """A point that shines equally in all directions. Takes `NAME.position` (3,) in object sizes and `NAME.intensity`
+    (3,) linear radiant intensity. The interior adjoint is right for the intensity; for a position Mitsuba raises."""
 
 
 WIDEST, NARROWEST = 89.9, 0.1  # angles of a spot's edge, degrees
@@ -95,12 +91,9 @@ SOFTEST = 0.99  # largest share of that angle at which the light begins to fall 
 
 @dataclass(frozen=True, eq=False)
 class SpotLamp(_Point):
-    """A point that shines in a cone, as Mitsuba's `spot`.
-
-    Up to `beam` from its axis it shines evenly, and from there to `cutoff` its intensity, which is that on the axis,
-    falls off linearly with the angle. Takes `NAME.intensity` (3,) linear radiant intensity, for which the interior
-    adjoint is right.
-    """
+    """A point that shines in a cone, as Mitsuba's `spot`. Up to `beam` from its axis it shines evenly, and from there
+    to `cutoff` its intensity, which is that on the axis, falls off linearly with the angle. Takes `NAME.intensity` (3,)
+    linear radiant intensity, for which the interior adjoint is right."""
 
     direction: Triple = (0.0, 0.0, -1.0)  # unit vector along its axis; z down where that is 0
     cutoff: float = 45.0  # angle from the axis beyond which it is dark, degrees; taken to `NARROWEST` to `WIDEST`
@@ -159,9 +152,7 @@ CAMERA = "camera"  # what carries the lamps of the car that the camera is in
 @dataclass(frozen=True, eq=False)
 class BeamLamp(ScenePart):
     """A point on a mesh, or before the camera, that shines by a table, such as a headlamp; the camera does not see it.
-
-    Takes `NAME.to_world` (4, 4), its pose, which it has once what carries it stands there; its brightness stays.
-    """
+    Takes `NAME.to_world` (4, 4), its pose, which it has once what carries it stands there; its brightness stays."""
 
     carrier: str  # the mesh that carries it, or `CAMERA`
     seat: Doubles  # (4, 4) its pose in what carries it (`geometry.seated`): it shines along its +z and has +y up
@@ -184,17 +175,14 @@ class BeamLamp(ScenePart):
 
 
 Lamp = PointLamp | SpotLamp | BallLamp | BeamLamp
-PATTERN = ".pattern"
-"""What the name of an input ends in that is the picture of a projector."""
+PATTERN = ".pattern"  # what the name of an input ends in that is the picture of a projector
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectorPart(ScenePart):
-    """A projector, as Mitsuba's `projector`: a point that throws a picture, and that the camera does not see.
-
-    Takes `NAME.pose` (4, 4), as a camera's, and `NAME.pattern` (h, w, 3): what a white matt screen shows that faces it
-    at distance 1, linear radiance. The interior adjoint is right for the pattern.
-    """
+    """A projector, as Mitsuba's `projector`: a point that throws a picture, and that the camera does not see. Takes
+    `NAME.pose` (4, 4), as a camera's, and `NAME.pattern` (h, w, 3): what a white matt screen shows that faces it at
+    distance 1, linear radiance. The interior adjoint is right for the pattern."""
 
     fov: float = 30.0  # angle of the picture's width, degrees
     sides: tuple[int, int] = (2, 2)  # rows and columns of the picture
@@ -228,11 +216,8 @@ class PlacedCamera:
 @dataclass(frozen=True, eq=False)
 class HazePart(ScenePart):
     """One grey medium in a ball around the origin that camera and object stand in; it scatters evenly in all
-    directions.
-
-    Takes `NAME.density` (1,), the extinction per object size, and `NAME.albedo` (3,), the share of the light that is
-    scattered and not absorbed.
-    """
+    directions. Takes `NAME.density` (1,), the extinction per object size, and `NAME.albedo` (3,), the share of the
+    light that is scattered and not absorbed."""
 
     radius: float  # of the ball that it fills, object sizes
     density: float = 0.0  # by itself; none by default, for a control to fill
@@ -253,10 +238,8 @@ class PluginNumber:
 
 @dataclass(frozen=True, eq=False)
 class PluginNumbers(ScenePart):
-    """Numbers and colours of what is in the scene already.
-
-    Takes the inputs of its numbers that begin with `NAME.`, (1,) or (3,) each.
-    """
+    """Numbers and colours of what is in the scene already. Takes the inputs of its numbers that begin with `NAME.`,
+    (1,) or (3,) each."""
 
     numbers: tuple[PluginNumber, ...] = ()  # some of the scene
 

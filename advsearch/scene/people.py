@@ -68,8 +68,7 @@ _JOINTS = (
     for side in ("left", "right")
     for name, low, high, text in LIMBS
 )
-PARAMETERS = (*PHENOTYPE, *WALK, *SPINE, *_JOINTS)
-"""Everything that a person can be asked for."""
+PARAMETERS = (*PHENOTYPE, *WALK, *SPINE, *_JOINTS)  # everything that a person can be asked for
 GAIT = {
     "hip": (30, 24, 16, 6, -3, -10, -6, 10, 25, 31),
     "knee": (4, 16, 15, 8, 4, 10, 36, 60, 50, 15),

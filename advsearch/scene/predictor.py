@@ -15,8 +15,7 @@ NOISE = "noise is part of the picture without the denoiser"
 """A reason against predictions that stands alone: with the denoiser, the same pictures could be predicted."""
 BETWEEN = (0.02, 0.29, 0.61, 0.97)
 """Places in the range of a continuous parameter at which its effect on the inputs is looked up."""
-MOST_BYTES = 2**30
-"""Memory of what one predictor keeps, times `ADVSEARCH_LIMITS`."""
+MOST_BYTES = 2**30  # memory of what one predictor keeps, times `ADVSEARCH_LIMITS`
 
 
 class Predictor(ABC):
@@ -32,7 +31,7 @@ class Predictor(ABC):
     def renderer(self) -> Renderer:
         """A renderer of the same space whose pictures are the predicted ones."""
         # made each time: two objects that hold each other are freed late, and matrices are large
-        return self.traced.predicted_by(self.radiance)
+        return self.traced.like(predict=self.radiance)
 
     def __call__(self, u: Tensor) -> Tensor:
         """Return the picture (H, W, 3) sRGB of a configuration (d,); differentiable."""

@@ -15,16 +15,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, sparse
-from scipy.sparse import csgraph
+from scipy import ndimage
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Bools, Doubles, Floats, Ints, Mesh, face_vectors
+from advsearch.scene.importing.geometry import connected
 
-TOLERANCE = 1e-6
-"""Barycentric weight by which a pixel's centre may miss a triangle, so that shared edges leave no gaps."""
-MISS = 1e-4
-"""Pixels by which a centre may miss a triangle and still be looked at."""
+TOLERANCE = 1e-6  # barycentric weight by which a pixel's centre may miss a triangle, so that shared edges leave no gaps
+MISS = 1e-4  # pixels by which a centre may miss a triangle and still be looked at
 
 
 def pixels_in(
@@ -103,7 +101,6 @@ def _ranges(low: Doubles, high: Doubles, size: int, miss: float) -> tuple[Ints, 
 
 
 def _crossing(corners: Doubles, row: Ints, miss: float) -> tuple[Doubles, Doubles]:
-    """Leftmost and rightmost column where a row's line meets a triangle: corners (N, 3, 2), row (N,)."""
     left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
     for begin, end in ((0, 1), (1, 2), (2, 0)):
         (x0, y0), (x1, y1) = corners[:, begin].T, corners[:, end].T
@@ -122,21 +119,13 @@ BORDER = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """The rasterised charts of a mesh.
-
-    Attributes:
-        mesh: the mesh.
-        face: (h, w) index of the face that each texel lies in; uncovered texels have that of the nearest covered one.
-        weights: (h, w, 3) barycentric weights of the face's three corners, at least 0, adding up to 1.
-        covered: (h, w) the texel's centre lies in a chart.
-        distance: (h, w) texels to the nearest covered texel; 0 where covered.
-    """
+    """The rasterised charts of a mesh."""
 
     mesh: Mesh
-    face: Ints
-    weights: Doubles
-    covered: Bools
-    distance: Doubles
+    face: Ints  # (h, w) of the face that each texel lies in; uncovered texels have that of the nearest covered one
+    weights: Doubles  # (h, w, 3) barycentric weights of the face's three corners, at least 0, adding up to 1
+    covered: Bools  # (h, w) the texel's centre lies in a chart
+    distance: Doubles  # (h, w) texels to the nearest covered texel; 0 where covered
 
     @property
     def touched(self) -> Bools:
@@ -165,22 +154,6 @@ class Charts:
         return np.where(self.covered, share[self.face], 0.0).astype(np.float32)
 
 
-def texel_positions(mesh: Mesh, resolution: int) -> tuple[Floats, Floats, Bools]:
-    """Return where each texel of a square texture lies on a mesh with texture coordinates, and the surface's normal
-    there.
-
-    Returns:
-        (h, w, 3) positions in mesh coordinates and (h, w, 3) unit shading normals, row 0 at v = 1, both filled in
-        everywhere from the nearest covered texel; and an (h, w) mask of the texels that a lookup on the surface can
-        touch: those in a chart and `BORDER` texels around it.
-
-    Raises:
-        InputError: the texture coordinates cover no texel.
-    """
-    charts = rasterised(mesh, resolution)
-    return charts.positions(), charts.normals(), charts.touched
-
-
 def texels_of_faces(mesh: Mesh, faces: Ints, shape: tuple[int, int]) -> tuple[Bools, float]:
     """Return the texels (h, w) that bilinear lookups on some faces, by their numbers (N,), read and lookups on all
     others do not, and their share of those that lookups on these faces read."""
@@ -190,18 +163,10 @@ def texels_of_faces(mesh: Mesh, faces: Ints, shape: tuple[int, int]) -> tuple[Bo
     return alone, float(alone.sum()) / max(1, int(read.sum()))
 
 
-def texel_area(mesh: Mesh, resolution: int | tuple[int, int]) -> Floats:
-    """Return the surface area that each texel stands for, (h, w) in squared mesh units; 0 where no chart is."""
-    return rasterised(mesh, resolution).areas()
-
-
 def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     """Find the face and the barycentric weights behind every texel centre of a texture, square where its resolution is
-    one number. Where charts overlap, one of their faces wins.
-
-    Raises:
-        InputError: the texture coordinates cover no texel.
-    """
+    one number. Where charts overlap, one of their faces wins. Raises InputError: the texture coordinates cover no
+    texel."""
     shape = (resolution, resolution) if isinstance(resolution, int) else resolution
     corners = _in_texels(mesh, shape)
     face, row, column = pixels_near(corners, shape)
@@ -283,17 +248,13 @@ class MeshSurface:
         inside = (np.linalg.norm(gap, axis=1) <= radius) & (self.normals @ normal > 0.0)
         inside[face] = True
         links = self._neighbours[inside[self._neighbours].all(axis=1)]
-        count = len(inside)
-        graph = sparse.coo_matrix((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(count, count))
-        labels = csgraph.connected_components(graph, directed=False)[1]
+        labels = connected(len(inside), *links.T)
         return np.asarray(inside & (labels == labels[face]))
 
 
 def welded(mesh: Mesh) -> tuple[Ints, int]:
-    """Return the number of the place that each vertex lies at (V,), and how many places there are.
-
-    Vertices that UV seams and creases split share a place: 1e-5 of the mesh's largest extent apart or less.
-    """
+    """Return the number of the place that each vertex lies at (V,), and how many places there are. Vertices that UV
+    seams and creases split share a place: 1e-5 of the mesh's largest extent apart or less."""
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     rounded = np.round(mesh.vertices.astype(np.float64) / max(extent, 1e-12) * 1e5)
     place = np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
@@ -301,10 +262,8 @@ def welded(mesh: Mesh) -> tuple[Ints, int]:
 
 
 def _in_texels(mesh: Mesh, shape: tuple[int, int]) -> Doubles:
-    """Texture coordinates of the faces' corners, (F, 3, 2): column and row, integers at texel centres.
-
-    Where a texture repeats, each face is moved by whole textures, so that its middle lies in the first one.
-    """
+    """Texture coordinates of the faces' corners, (F, 3, 2): column and row, integers at texel centres. Where a texture
+    repeats, each face is moved by whole textures, so that its middle lies in the first one."""
     uvs = mesh.uvs[mesh.faces].astype(np.float64)
     if mesh.repeats:
         uvs -= np.floor(uvs.mean(axis=1, keepdims=True))
@@ -312,6 +271,5 @@ def _in_texels(mesh: Mesh, shape: tuple[int, int]) -> Doubles:
 
 
 def _face_normals(mesh: Mesh) -> Doubles:
-    """Unit normals (F, 3) of the flat faces; zero for a face without area."""
     normals = face_vectors(mesh.vertices[mesh.faces].astype(np.float64))
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20))

@@ -12,7 +12,6 @@ get their derivative from a second one, which is the identity in the forward pas
 from __future__ import annotations
 
 import copy
-import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -23,16 +22,26 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 import torch
-from PIL import Image
 from torch import Tensor
 
 from advsearch import seeds
 from advsearch.errors import InputError
-from advsearch.scene.assembly import ON_PICTURE, Motion, central, steps_for
+from advsearch.pictures import png_of
+from advsearch.scene.assembly import ON_PICTURE, Motion, central
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import ImageFormation, Later, Moment, levels_of
 from advsearch.scene.geometry import camera_to_world, middle
-from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_order, first_plan
+from advsearch.scene.gradients import (
+    BY_ADJOINT,
+    BY_DIFFERENCES,
+    DEFAULT_PIXELS,
+    DEFAULT_STEP,
+    STEP_RANGE,
+    TURN_STEP,
+    Group,
+    first_order,
+    first_plan,
+)
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.rig import Mount
@@ -40,8 +49,7 @@ from advsearch.scene.surfaces import Surfaces
 
 MAX_SPP = 65536
 
-Configuration = Tensor | npt.NDArray[np.floating[Any]] | Sequence[float]
-"""A point of the unit box."""
+Configuration = Tensor | npt.NDArray[np.floating[Any]] | Sequence[float]  # a point of the unit box
 
 Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
 """From scene inputs, seed and samples a pixel to linear radiance (H, W, 3)."""
@@ -75,8 +83,7 @@ class InputSpace(Later, Protocol):
         """Return the numbers of the configuration, in their units, by name; differentiable."""
 
 
-MOST_MEASURED = 64
-"""Coordinates of a group up to which it is measured how far they move outlines."""
+MOST_MEASURED = 64  # coordinates of a group up to which it is measured how far they move outlines
 SMALL_PART = 0.0625
 """Part of noise that is taken through the tone curve, which is straight over so little; see `Renderer.halves`."""
 
@@ -137,10 +144,7 @@ class Renderer:
     def _repr_png_(self) -> bytes:
         """The start as a notebook shows it; it does not count as a render."""
         with torch.no_grad():
-            levels = levels_of(self.like()(self.start))
-        held = io.BytesIO()
-        Image.fromarray(levels.numpy()).save(held, "PNG")
-        return held.getvalue()
+            return png_of(levels_of(self.like()(self.start)).numpy())
 
     @property
     def composed(self) -> str:
@@ -150,27 +154,27 @@ class Renderer:
             return "a picture is made of those of several cameras"
         return "a picture is made of several moments" if self.moments else ""
 
-    def like(self, scene: MitsubaScene | None = None, **formation: Any) -> Renderer:
-        """Return a renderer of the same space with another scene, or other fields of the image formation.
+    def like(
+        self,
+        scene: MitsubaScene | None = None,
+        *,
+        source: Source | None = None,
+        predict: Predict | None = None,
+        **formation: Any,
+    ) -> Renderer:
+        """Return a renderer of the same space that counts on from this one's counters, by itself.
 
-        It counts on from this one's counters, by itself.
+        Args:
+            scene: in place of this one's.
+            source: another program, which renders and denoises.
+            predict: what predicts radiance (`scene.predictor`): seed and samples of a call mean nothing then, and every
+                derivative runs back through scene inputs, whatever the plan says.
+            formation: other fields of the image formation.
         """
         other = copy.copy(self)
         other.formation = replace(self.formation, **formation)
-        other.scene = self.scene if scene is None else scene
-        return other
-
-    def rendered_by(self, source: Source) -> Renderer:
-        """Return a renderer of the same space whose pictures another program renders, and denoises; as of `like`."""
-        other = self.like()
-        other._source = source
-        return other
-
-    def predicted_by(self, predict: Predict) -> Renderer:
-        """Return a renderer of the same space whose radiance is predicted (`scene.predictor`): seed and samples of a
-        call mean nothing to it, and every derivative runs back through scene inputs, whatever the plan says."""
-        other = self.like()
-        other._predict = predict
+        other.scene, other._source = scene or self.scene, source or self._source
+        other._predict = predict or self._predict
         return other
 
     def __call__(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
@@ -192,7 +196,7 @@ class Renderer:
             InputError: u has another shape, or values outside [0, 1], or spp is out of range; or u requires a gradient
                 and was made in `torch.inference_mode`.
         """
-        u = u if isinstance(u, Tensor) else _tensor(u)
+        u = _tensor(u)
         if u.ndim == 2 and len(u):
             return torch.stack([self(row, seed, spp) for row in u])
         u, through = self._given(u, spp)
@@ -204,24 +208,19 @@ class Renderer:
 
     def radiance(self, u: Configuration, seed: int = 0, spp: int = 16) -> Tensor:
         """Render linear radiance, denoised if the formation says so; arguments as for a call; (H, W, 3) float32.
-
-        Exposure and backdrop of the configuration are in it; what controls do to the finished picture is not.
-        """
+        Exposure and backdrop of the configuration are in it; what controls do to the finished picture is not."""
         _, through = self._given(u, spp)
         with _no_inference():
             return self._picture(through, seed, spp, display=False)
 
     def halves(self, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor, Tensor]:
         """Trace two pictures (H, W, 3) of a configuration with independent noise, which are not denoised; and return
-        beside them that of all their samples, which is. Arguments as for a call; without a graph, and not counted.
-
-        The two are taken through a tone curve that is straight about the third, so that they are right on average, and
-        not darker where they are noisy; they may leave [0, 1].
-        """
+        beside them that of all their samples, which is. Arguments as for a call; without a graph, and not counted. The
+        two are taken through a tone curve that is straight about the third, so that they are right on average, and not
+        darker where they are noisy; they may leave [0, 1]."""
         with torch.no_grad():
             inputs = self.scene.assembly(self.space.inputs(u))
-            hide = "backdrop.color" in inputs
-            traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+            hide, traced = "backdrop.color" in inputs, _traced(inputs)
             undenoised = self.like(denoiser="none")
             numbers = [seeds.stream(seed, "traced", half) for half in range(2)]
             halves = [undenoised.rendered(traced, number, spp, hide) for number in numbers]
@@ -236,10 +235,8 @@ class Renderer:
             return first, second, self.space.picture(u, there)
 
     def mask(self, u: Configuration) -> Tensor:
-        """Return the pixels in which the object is the first thing that the camera sees, (H, W) bool.
-
-        It is asked for at the middle of each pixel. What controls do to the finished picture moves nothing in it.
-        """
+        """Return the pixels in which the object is the first thing that the camera sees, (H, W) bool. It is asked for
+        at the middle of each pixel. What controls do to the finished picture moves nothing in it."""
         return self.surfaces(u).seen(OBJECT)
 
     def surfaces(self, u: Configuration, fineness: int = 1, camera: int = 0) -> Surfaces:
@@ -249,8 +246,7 @@ class Renderer:
         u, _ = self._given(u, 1)
         with torch.no_grad():
             rig = self.scene.made[0].rig
-            mount = rig[camera] if rig else None
-            seen = self.scene.surfaces(_traced(self._seen(mount, self._then(mount), u)), fineness)
+            seen = self.scene.surfaces(_traced(self._seen(rig[camera] if rig else None, u)), fineness)
         metres = self.scene.made[0].metres
         return replace(seen, depth=seen.depth * metres, z_depth=seen.z_depth * metres)
 
@@ -290,7 +286,7 @@ class Renderer:
     def _given(self, u: Configuration, spp: int) -> tuple[Tensor, Tensor]:
         """Return a configuration as float32, and with a graph only where the derivative runs back through scene inputs
         or the picture; raises as `__call__`."""
-        u = u.float() if isinstance(u, Tensor) else _tensor(u)
+        u = _tensor(u)
         if u.shape != self._shape:
             raise InputError(f"render: expected u of shape {tuple(self._shape)}, got {tuple(u.shape)}")
         if not 1 <= spp <= MAX_SPP:
@@ -321,8 +317,7 @@ class Renderer:
         return torch.cat(views, dim=1)
 
     def _view(self, mount: Mount | None, u: Tensor, seed: int, spp: int, *, display: bool) -> Tensor:
-        """The picture of one camera of a rig, or of the only one; as of `_picture`."""
-        inputs = self._seen(mount, self._then(mount), u)
+        inputs = self._seen(mount, u)
         hide = "backdrop.color" in inputs
         if self.moments:
             rendered = self._exposed(mount, u, seed, spp, hide)
@@ -330,23 +325,17 @@ class Renderer:
             rendered = self.rendered(_traced(inputs), seed, spp, hide)
         return self.finished(rendered, inputs, u, display=display)
 
-    def _then(self, mount: Mount | None) -> Later:
-        """The space when a camera of a rig takes its picture."""
-        return self.space.later(mount.later) if mount is not None and mount.later else self.space
-
-    def _seen(self, mount: Mount | None, space: Later, u: Tensor) -> dict[str, Tensor]:
-        """Scene inputs of u as a camera of a rig, or the only one, sees them."""
-        inputs = self.scene.assembly(space.inputs(u))
-        if mount is None:
-            return inputs
-        description = self.scene.made[0]
-        return mount.seen(inputs, *_standing(description), description.metres)
+    def _seen(self, mount: Mount | None, u: Tensor, then: Later | None = None) -> dict[str, Tensor]:
+        """Scene inputs of u as a camera of a rig, or the only one, sees them: when it takes its picture, or `then`."""
+        space = then or (self.space.later(mount.later) if mount and mount.later else self.space)
+        inputs, description = self.scene.assembly(space.inputs(u)), self.scene.made[0]
+        return mount.seen(inputs, *_standing(description), description.metres) if mount else inputs
 
     def _exposed(self, mount: Mount | None, u: Tensor, seed: int, spp: int, hide: bool) -> Tensor:
-        """The mean radiance of the moments of u, denoised once; as of `rendered`, and it counts as one render."""
+        # the mean radiance of the moments of u, denoised once, which counts as one render
         renders, exposed, guides = self.renders, torch.zeros(()), torch.zeros(())
         for number, moment in enumerate(self.moments):
-            inputs = _traced(self._seen(mount, moment.space, u))
+            inputs = _traced(self._seen(mount, u, moment.space))
             noise = seeds.stream(seed, "moment", number)
             rows, samples = moment.rows[:, None, None], max(1, math.ceil(spp * moment.samples))
             exposed = exposed + rows * self.rendered(inputs, noise, samples, hide, denoised=False)
@@ -397,14 +386,12 @@ class Renderer:
     # ---- differences ------------------------------------------------------------------------------------------------
 
     def _differenced(self) -> tuple[Group, ...]:
-        return self.plan.having(*sorted(BY_DIFFERENCES - self._left_out))
+        return self.plan.having(*(BY_DIFFERENCES - self._left_out))
 
     def differences(self, u: Tensor, cotangent: Tensor, seed: int, spp: int) -> Tensor:
-        """Gradient of `sum(cotangent * picture)` for the coordinates that use differences; zero for the others.
-
-        All renders share one seed (common random numbers), and the picture is taken after the tone curve and after
-        what controls do to it.
-        """
+        """Gradient of `sum(cotangent * picture)` for the coordinates that use differences; zero for the others. All
+        renders share one seed (common random numbers), and the picture is taken after the tone curve and after what
+        controls do to it."""
         noise = seeds.stream(self.root_seed, "differences", seed)
         spp = self.plan.spp or spp
         derivative = torch.zeros_like(u)
@@ -415,15 +402,13 @@ class Renderer:
     # ---- set-up -----------------------------------------------------------------------------------------------------
 
     def _steps(self, groups: tuple[Group, ...], motion: Motion | None) -> Tensor:
-        """Half-widths (d,) of differences over which outlines move by a pixel."""
         speeds = torch.zeros(len(self.start))
-        moving: list[int] = []
-        for group in groups:
-            if set(group.valid) - {"adjoint", "image"} and group.size <= MOST_MEASURED:
-                moving += range(group.begin, group.begin + group.size)
+        few = [g for g in groups if {*g.valid} - {"adjoint", "image"} and g.size <= MOST_MEASURED]
+        moving = [number for group in few for number in range(group.begin, group.begin + group.size)]
         if motion is not None and moving:
             speeds = motion.speeds(lambda u: self.scene.assembly(self.space.inputs(u)), self.start, moving)
-        steps = steps_for(speeds)
+        moving_a_pixel = DEFAULT_PIXELS / speeds.clamp_min(1e-3)
+        steps = torch.where(speeds > 1e-3, moving_a_pixel, torch.full_like(speeds, DEFAULT_STEP)).clamp(*STEP_RANGE)
         for group in groups:
             if group.periodic and not bool(speeds[group.coordinates].any()):
                 steps[group.coordinates] = TURN_STEP
@@ -452,13 +437,11 @@ class Renderer:
 
 @lru_cache(maxsize=4)
 def _standing(description: SceneDescription) -> tuple[Tensor, Tensor]:  # which takes a look at every vertex
-    """The pose (4, 4) of a scene's camera, and the middle (3,) of its object."""
     pose, center = camera_to_world(description), middle(description)
     return torch.from_numpy(pose).float(), torch.from_numpy(center).float()
 
 
 def _traced(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The inputs that Mitsuba takes."""
     return {name: value for name, value in inputs.items() if name not in ON_PICTURE}
 
 
@@ -468,7 +451,6 @@ def _no_inference() -> AbstractContextManager[object]:
 
 
 def _tensor(u: Configuration) -> Tensor:
-    """u as float32."""
     try:
         return torch.as_tensor(u, dtype=torch.float32)
     except (TypeError, ValueError, RuntimeError):
@@ -489,7 +471,6 @@ class _Radiance(torch.autograd.Function):
         denoised: bool,
         *tensors: Tensor,
     ) -> Tensor:
-        """Radiance of given scene inputs, with coverage if hidden."""
         ctx.renderer, ctx.names, ctx.seed, ctx.spp, ctx.hide = renderer, names, seed, spp, hide
         ctx.save_for_backward(*tensors)
         inputs, noise = dict(zip(names, tensors, strict=True)), seeds.stream(renderer.root_seed, "primal", seed)
@@ -511,10 +492,8 @@ class _Radiance(torch.autograd.Function):
     @staticmethod
     @first_order
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradient of `sum(cotangent * radiance)` for the inputs whose coordinates use an adjoint.
-
-        The denoiser counts as the identity. An input that no coordinate needs is left out.
-        """
+        """Gradient of `sum(cotangent * radiance)` for the inputs whose coordinates use an adjoint. The denoiser counts
+        as the identity. An input that no coordinate needs is left out."""
         renderer: Renderer = ctx.renderer
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
         noise = seeds.stream(renderer.root_seed, "gradient", ctx.seed)

@@ -26,18 +26,15 @@ from advsearch.scene.skeleton import entries_of_turn
 from advsearch.yaml_text import LARGEST, parse_yaml
 
 MOST_CAMERAS = 32
-FARTHEST = 1e4
-"""Metres, or object sizes, that a camera may be from the first."""
+FARTHEST = 1e4  # metres, or object sizes, that a camera may be from the first
 KEYS = ("name", "place", "turn", "around", "fov", "later")
-LATEST = 60.0
-"""Seconds after the first picture."""
+LATEST = 60.0  # seconds after the first picture
 AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
 """From x to the right, y down, z ahead to Mitsuba's: x to the left, y up, z ahead."""
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From nerfstudio's axes of a camera, x to the right, y up, z back, to x to the right, y down, z ahead."""
 COLMAPS = "images.txt"
-MOST_BYTES = 1 << 26
-"""Of COLMAP's images, whose lines of points are skipped."""
+MOST_BYTES = 1 << 26  # of COLMAP's images, whose lines of points are skipped
 STEP = "T_cn_cnm1"  # Kalibr's: from points of the camera before to points of this one
 
 
@@ -138,7 +135,6 @@ def _numbers(where: str, key: str, given: Any, count: int, most: float) -> list[
 
 
 def _about(axis: int, angle: float) -> Doubles:
-    """A rotation about one of the axes, (3, 3)."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     turn = np.eye(3)
     turn[[first, second], [first, second]] = math.cos(angle)
@@ -147,7 +143,6 @@ def _about(axis: int, angle: float) -> Doubles:
 
 
 def _of_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
-    """Kalibr's cameras, each with a step from the one before; empty where it is no such file."""
     cameras = {name: camera for name, camera in data.items() if isinstance(camera, dict) and "intrinsics" in camera}
     names = sorted(cameras, key=lambda name: (len(str(name)), str(name)))
     if len(names) < 2 or len(names) > MOST_CAMERAS or not all(STEP in cameras[name] for name in names[1:]):
@@ -159,7 +154,6 @@ def _of_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
 
 
 def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
-    """Frames of nerfstudio's transforms.json by their numbers; `transform_matrix` is from the camera to the world."""
     data = read_json(path, camera_text(path, LARGEST_JSON))
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
@@ -170,10 +164,11 @@ def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
         _rigid(f"{path}: frame {name}", "transform_matrix", frame.get("transform_matrix")) @ FROM_OPENGL
         for name, frame in chosen.items()
     ]
-    lenses = {name: {key: frame[key] for key in frame if key in OF_A_FRAME} for name, frame in chosen.items()}
+    lenses = [{key: frame[key] for key in frame if key in OF_A_FRAME} for frame in chosen.values()]
     first = read_camera(f"{path}#{names[0]}")
-    same = {name: lens == lenses[names[0]] for name, lens in lenses.items()}
-    return _mounted(path, names, poses, [first if same[name] else read_camera(f"{path}#{name}") for name in names])
+    each = zip(names, lenses, strict=True)
+    models = [first if lens == lenses[0] else read_camera(f"{path}#{name}") for name, lens in each]
+    return _mounted(path, names, poses, models)
 
 
 def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
@@ -231,7 +226,6 @@ def _mounted(
 
 
 def _rigid(where: str, key: str, given: Any) -> Doubles:
-    """A rotation and a shift, (4, 4), from four rows."""
     rows = given if isinstance(given, list) and all(isinstance(row, list) for row in given) else []
     step = np.array(_numbers(where, key, [number for row in rows for number in row], 16, FARTHEST)).reshape(4, 4)
     turn, last = step[:3, :3], step[3]

@@ -61,7 +61,6 @@ class SkeletonRig:
         self._rest = self.posed({})
 
     def _gather(self, parts: Sequence[Movable], vertices: Ints) -> None:
-        """Lay the parts one after the other, and keep what the mesh has of them."""
         widest = max(part.joints.shape[1] for part in parts)
         counts = [len(part.vertices) for part in parts]
         starts, slots = np.cumsum([0, *counts]), np.cumsum([0, *(len(part.nodes) for part in parts)])
@@ -190,7 +189,6 @@ class SkeletonRig:
         return places, {track.node: sampled(track, seconds) for track in clip.tracks if track.path == "weights"}
 
     def _turned(self, places: Tensor, number: Mapping[str, Tensor]) -> Tensor:
-        """Places (N, 4, 4) of all nodes, joints turned on top."""
         upright = self._upright.to(places.device)
         for joint in dict.fromkeys(name.rpartition(".")[0] for name in number if name.rpartition(".")[2] in AXES):
             node, turn = self.joints[joint], torch.eye(3, dtype=torch.float64, device=places.device)
@@ -207,7 +205,6 @@ class SkeletonRig:
         return places
 
     def _world(self, places: Tensor) -> Tensor:
-        """(N, 4, 4) from each node to the scene."""
         levels = list[Tensor]()
         for level, parents in self._levels:
             here = places[level.to(places.device)]
@@ -215,7 +212,6 @@ class SkeletonRig:
         return torch.cat(levels)[self._back.to(places.device)]
 
     def _morphed(self, number: Mapping[str, Tensor], weights: Mapping[int, Tensor], device: torch.device) -> Tensor:
-        """The vertices (V, 3) in their meshes' coordinates, morph targets added."""
         points = self._points.to(device)
         for name, node, index, rest, rows, moves in self._targets:
             weight = number.get(f"{name}.{WEIGHT}")

@@ -15,49 +15,28 @@ from advsearch.errors import InputError, UnknownNameError
 
 @dataclass(frozen=True)
 class Parameter:
-    """One coordinate of a search: a named, bounded number, tensor or choice.
+    """One coordinate of a search: a named, bounded number, tensor or choice. Settings of a scene and parameters of
+    controls are both this, so that what `--set` fixes today a control can search tomorrow under the same name."""
 
-    Settings of a scene and parameters of controls are both this, so that what `--set` fixes today a control can search
-    tomorrow under the same name.
-
-    Attributes:
-        name: short name; `control.name` addresses it everywhere.
-        shape: of its value; () for a number, None in a place that depends on the scene or a choice.
-        unit: "degrees", "metres", "object sizes", "sRGB", "stops", "name", ..., or "1".
-        low: smallest allowed value (0 for a choice among names).
-        high: largest allowed value (number of names - 1 for a choice among names).
-        default: the value that leaves the scene as it is, in words if it depends on the scene.
-        description: one sentence.
-        periodic: the value and the value plus 360 degrees (`high - low` of a full turn) are the same.
-        moves_silhouettes: changing it can move an outline in the picture, so interior adjoints miss a term.
-        search: the range that is searched when nothing is said about the parameter; None: it stays at its default.
-        log: the unit interval runs over the logarithm of the value (scales, powers, distances).
-        options: the names of a discrete choice, which has no derivative; empty for numbers.
-        estimators: the valid ways to differentiate it, preferred first (keys of `gradients.plan.ESTIMATORS`).
-    """
-
-    name: str
-    shape: tuple[int | None, ...]
-    unit: str
-    low: float
-    high: float
-    default: float | str
-    description: str
-    periodic: bool = False
-    moves_silhouettes: bool = False
-    search: tuple[float, float] | None = None
-    log: bool = False
-    options: tuple[str, ...] = ()
-    estimators: tuple[str, ...] = ("differences",)
+    name: str  # short; `control.name` addresses it everywhere
+    shape: tuple[int | None, ...]  # of its value; () for a number, None where it depends on the scene or a choice
+    unit: str  # "degrees", "metres", "object sizes", "sRGB", "stops", "name", ..., or "1"
+    low: float  # smallest allowed value (0 for a choice among names)
+    high: float  # largest allowed value (number of names - 1 for a choice among names)
+    default: float | str  # the value that leaves the scene as it is, in words if it depends on the scene
+    description: str  # one sentence
+    periodic: bool = False  # the value and the value plus 360 degrees (`high - low` of a full turn) are the same
+    moves_silhouettes: bool = False  # it can move an outline in the picture, so interior adjoints miss a term
+    search: tuple[float, float] | None = None  # range that is searched by default; None: it stays at its default
+    log: bool = False  # the unit interval runs over the logarithm of the value (scales, powers, distances)
+    options: tuple[str, ...] = ()  # the names of a discrete choice, which has no derivative; empty for numbers
+    estimators: tuple[str, ...] = ("differences",)  # valid ways to differentiate it, preferred first
 
 
-GEOMETRIC = ("secant", "differences", "material")
-"""Valid estimators for what moves a mesh."""
-ORBIT = ("secant", "differences")
-"""Mitsuba has no derivative of sensors, so a camera is differentiated by differences."""
+GEOMETRIC = ("secant", "differences", "material")  # valid estimators for what moves a mesh
+ORBIT = ("secant", "differences")  # Mitsuba has no derivative of sensors, so a camera is differentiated by differences
 CHANNELS = ("red", "green", "blue")
-LIT = ("adjoint", "differences")
-"""Valid estimators for what only changes light and colours."""
+LIT = ("adjoint", "differences")  # valid estimators for what only changes light and colours
 
 
 def moving(
@@ -99,8 +78,7 @@ POSE = (
     _pose("z", "object sizes", -1e4, 1e4, 0.0, "Height of the lowest point above the ground."),
     _pose("scale", "1", 0.01, 100.0, 1.0, "Size relative to the default.", (0.8, 1.25), log=True),
 )
-ORBIT_CAMERA = "orbit"
-"""The camera that the settings `camera.*` describe: on a sphere around the object, looking at it."""
+ORBIT_CAMERA = "orbit"  # the camera that the settings `camera.*` describe: on a sphere around the object, looking at it
 
 CAMERA = (
     _camera("azimuth", "degrees", -3600.0, 3600.0, 40.0, "Direction of the camera around the object.", (0.0, 360.0),
@@ -127,8 +105,7 @@ DROPS = (
     Parameter("drop_size", (), "mm", 0.2, 10.0, 1.5, "Median of the radii of these drops.", estimators=()),
     Parameter("drop_seed", (), "1", 0.0, 1e6, 0.0, "Where they are, and how large: a whole number.", estimators=()),
 )  # fmt: skip
-LAMPS = ("off", "low", "high")
-"""What the lamps of a car may be: with either beam its tail lamps shine too."""
+LAMPS = ("off", "low", "high")  # what the lamps of a car may be: with either beam its tail lamps shine too
 
 
 def _lamps(whose: str) -> Parameter:
@@ -151,8 +128,7 @@ GROUND_KINDS = (
 ROADS, PLACES = (DRY_ROAD, WET_ROAD), (DRY_AVENUE, WET_AVENUE, SNOW_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM)
 PHOTOGRAPHED_FROM = 3.0
 """Height above the floor from which a photograph is taken of an object whose size is not known, object sizes."""
-TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))
-"""Settings that only a table has."""
+TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))  # settings that only a table has
 GROUND = (
     Parameter("kind", (), "name", 0.0, len(GROUND_KINDS) - 1.0,
               "what the environment has: photograph where the map is a file, a road in a street, else table",
@@ -206,13 +182,8 @@ def mesh_of(name: str) -> str | None:
 
 def resolve(given: Given) -> dict[str, float | None]:
     """Return every setting's value: what was given, checked, over the defaults; None where the scene works it out.
-
-    Settings of meshes around the object are there where they were given.
-
-    Raises:
-        UnknownNameError: a name is not a setting.
-        InputError: a value is not a finite number inside its range.
-    """
+    Settings of meshes around the object are there where they were given. Raises UnknownNameError: a name is not a
+    setting. Raises InputError: a value is not a finite number inside its range."""
     if "camera.elevation" in given and "camera.height" in given:
         raise InputError("`set` camera.elevation and camera.height say the same thing; leave one of them out")
     values = {name: None if isinstance(one.default, str) else one.default for name, one in SETTINGS.items()}

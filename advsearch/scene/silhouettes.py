@@ -20,14 +20,10 @@ from advsearch.scene.assets import Bools, Doubles
 from advsearch.scene.geometry import NEAREST
 from advsearch.scene.raster import pixels_in
 
-RASTER = 128
-"""Pixels along the longer side of a silhouette."""
-SCAN = 48
-"""Angles at which the coverage is looked up before the crossing is narrowed down."""
-HALVINGS = 12
-"""Steps that narrow it down."""
-GRID = 24
-"""Rows and columns of the directions that stand for the whole frame."""
+RASTER = 128  # pixels along the longer side of a silhouette
+SCAN = 48  # angles at which the coverage is looked up before the crossing is narrowed down
+HALVINGS = 12  # steps that narrow it down
+GRID = 24  # rows and columns of the directions that stand for the whole frame
 
 
 @dataclass(frozen=True)
@@ -67,11 +63,9 @@ class Silhouette:
     window: Frame
 
     def directions(self) -> Doubles:
-        """Unit directions (N, 3), one in each covered pixel; all stand for the same area of the picture.
-
-        Their places within the pixels are a low-discrepancy sequence (Roberts 2018), or an upright edge would hide
-        whole columns at a time.
-        """
+        """Unit directions (N, 3), one in each covered pixel; all stand for the same area of the picture. Their places
+        within the pixels are a low-discrepancy sequence (Roberts 2018), or an upright edge would hide whole columns at
+        a time."""
         row, column = np.nonzero(self.mask)
         (height, width), window = self.mask.shape, self.window
         number = np.arange(len(row))
@@ -115,19 +109,12 @@ def silhouette(points: Doubles, faces: npt.NDArray[np.uint32], frame: Frame | No
 
 @dataclass(frozen=True, eq=False)
 class Passage:
-    """A thing that moves sideways past another, both as the camera sees them.
+    """A thing that moves sideways past another, both as the camera sees them."""
 
-    Attributes:
-        hidden: directions (N, 3) in which what is to be hidden is seen.
-        cover: silhouette of the moving thing, straight ahead of the camera.
-        axes: (3, 3) rows: where its right, up and forward point when it is in the middle of the other.
-        direction: from which side it comes: degrees, 0 from the right of the picture, 90 from above.
-    """
-
-    hidden: Doubles
-    cover: Silhouette
-    axes: Doubles
-    direction: float
+    hidden: Doubles  # directions (N, 3) in which what is to be hidden is seen
+    cover: Silhouette  # of the moving thing, straight ahead of the camera
+    axes: Doubles  # (3, 3) rows: where its right, up and forward point when it is in the middle of the other
+    direction: float  # from which side it comes: degrees, 0 from the right of the picture, 90 from above
 
     def coverage(self, angles: Doubles) -> Doubles:
         """Return the hidden share (K,) at angles (K,) in radians away from the middle."""
@@ -145,11 +132,9 @@ class Passage:
         return np.array(shares)
 
     def solve(self, wanted: float, outside: float) -> float:
-        """Return the largest angle in radians at which the wanted share is hidden.
-
-        The thing comes in from `outside`; where it first hides as much as is wanted, it stops. If it never does, the
-        angle at which it hides most is returned.
-        """
+        """Return the largest angle in radians at which the wanted share is hidden. The thing comes in from `outside`;
+        where it first hides as much as is wanted, it stops. If it never does, the angle at which it hides most is
+        returned."""
         angles = np.linspace(outside, 0.0, SCAN)
         shares = self.coverage(angles)
         enough = np.nonzero(shares >= wanted)[0]

@@ -59,7 +59,6 @@ def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
 
 
 def _side_by_side(count: int) -> Doubles:
-    """Return UVs (F, 3, 2) of so many faces, two to each cell of a grid."""
     columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
     cell = np.arange(count) // 2
     corner = np.stack([cell % columns, cell // columns], axis=1)[:, None, :]
@@ -114,7 +113,6 @@ def _cells(middles: Doubles, patch: Ints) -> Ints:
 
 
 def _smoothed(unit: Doubles, f: Ints, g: Ints) -> Doubles:
-    """Average the normals (F, 3) of faces with their neighbours', a few times."""
     own = np.arange(len(unit))
     links = np.concatenate([f, g, own]), np.concatenate([g, f, own])
     average = coo_array((np.ones(len(links[0])), links), shape=(len(unit), len(unit))).tocsr()
@@ -192,7 +190,6 @@ class SurfaceParts:
 
 
 def _tells_apart(mesh: Mesh, uvs: Doubles) -> bool:
-    """Whether texture coordinates (F, 3, 2) give each place of a surface one of its own."""
     if uvs.min() < 0.0 or uvs.max() > 1.0:
         return False
     surface = np.linalg.norm(face_vectors(mesh.vertices[mesh.faces].astype(np.float64)), axis=1)

@@ -24,11 +24,7 @@ CHANNELS: Mapping[str, str] = {"mask": "Y", "depth": "Z", "normal": "XYZ", "uv":
 
 
 def aovs_of(text: str | None) -> tuple[str, ...]:
-    """Return the names in a list separated by commas, each once.
-
-    Raises:
-        UnknownNameError: one is not of `AOVS`.
-    """
+    """Return the names in a list separated by commas, each once. Raises UnknownNameError: one is not of `AOVS`."""
     names = dict.fromkeys(part.strip() for part in (text or "").split(",") if part.strip())
     for name in names:
         if name not in AOVS:
@@ -38,26 +34,17 @@ def aovs_of(text: str | None) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """The surface in each pixel, by the ray through its middle.
+    """The surface in each pixel, by the ray through its middle."""
 
-    Attributes:
-        names: of the shapes.
-        id: (H, W) int64: 1 for the first of the names and so on, 0 where there is nothing.
-        depth: (H, W) distance from the camera, infinite where there is nothing: metres, as renderers say it; object
-            sizes where the object's size is not known, and as Mitsuba's scenes say it.
-        z_depth: (H, W) the part of it that lies along the camera's axis.
-        normal: (H, W, 3) unit shading normal in world space.
-        uv: (H, W, 2) texture coordinates; v = 0 is the bottom row.
-        face: (H, W) int64 number of the triangle in its mesh.
-    """
-
-    names: tuple[str, ...]
-    id: Tensor
+    names: tuple[str, ...]  # of the shapes
+    id: Tensor  # (H, W) int64: 1 for the first of the names and so on, 0 where there is nothing
+    # (H, W) distance from the camera, infinite where there is nothing: metres, as renderers say it; object sizes where
+    # the object's size is not known, and as Mitsuba's scenes say it
     depth: Tensor
-    z_depth: Tensor
-    normal: Tensor
-    uv: Tensor
-    face: Tensor
+    z_depth: Tensor  # (H, W) the part of it that lies along the camera's axis
+    normal: Tensor  # (H, W, 3) unit shading normal in world space
+    uv: Tensor  # (H, W, 2) texture coordinates; v = 0 is the bottom row
+    face: Tensor  # (H, W) int64 number of the triangle in its mesh
 
     def seen(self, name: str) -> Tensor:
         """Return where a shape is what is seen, (H, W) bool."""

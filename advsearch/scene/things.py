@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 FARTHEST = 1000.0  # how far from the object a thing may stand, metres
 MOST = 64  # things beside an object
 OPTIONS = ("heading", "size", "name", "label", "lamps")
-ALL = "all"
-"""What stands for the object and every thing beside it."""
+ALL = "all"  # what stands for the object and every thing beside it
 TAKEN = ("object", "environment", "ground", "camera", *LAID, ALL)  # what a thing can't be called
 
 

@@ -71,7 +71,6 @@ def valid(environment: Surroundings, camera: CameraView) -> tuple[float, float]:
 
 
 def _reach(area: Box | float, azimuth: float) -> float:
-    """How far it is from the middle to the border of an area, along an azimuth."""
     if isinstance(area, float):
         return area
     x, y = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))

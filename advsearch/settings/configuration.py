@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args, get_origin
 
@@ -16,9 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError,
 
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.files import JsonObject, split_paths
-from advsearch.settings import power
 from advsearch.settings import values as written
-from advsearch.settings.power import LeftOut, Power
+from advsearch.settings.power import LeftOut, Power, none
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -30,79 +29,24 @@ Form = Literal["text", "switch", "names", "assignments", "axes", "choices", "con
 NAME=VALUES, NAME=CHOICE or a choice for all, NAME or NAME={OPTION: VALUE}."""
 
 
-def setting(
-    default: Any,
-    group: str,
-    description: str,
-    expects: str = "",
-    *,
-    unit: str = "",
-    otherwise: str = "",
-    flag: str = "",
-    metavar: str = "",
-    form: Form = "text",
-    switched: str = "",
-    power: Power = power.none,
-    **constraints: Any,
-) -> Any:
-    """Return a pydantic field.
-
-    Args:
-        default: the default, a function that makes it, or ... for none.
-        group: heading in the help.
-        description: what it is.
-        expects: completes "expected ..." in errors, and names the range in the help; empty where type and constraints
-            say it.
-        unit: of the value.
-        otherwise: what a default of None comes to.
-        flag: its flag, where that is not its name: "--control".
-        metavar: what stands for the value in the help, where that is not the last word of its name.
-        form: how it is written on a command line; what is true or false is a switch.
-        switched: what the flag does, where that is the opposite of the description.
-        power: says what a value does beyond the run, which only a person may ask for (`settings.power`).
-        constraints: as of `pydantic.Field`.
-    """
-    notes: dict[str, Any] = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise, "flag": flag}
-    notes |= {"metavar": metavar, "form": form, "switched": switched, "power": power}
-    extra: Any = {"notes": notes, "others": {"default": default, "description": description, **constraints}}
-    make = {"default_factory": default} if callable(default) else {"default": default}
-    return Field(**make, description=description, json_schema_extra=extra, **constraints)
-
-
-def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
-    """Return a setting as another command declares it, but for some of the arguments of `setting`."""
-    extra: Any = config.model_fields[field].json_schema_extra
-    return setting(**{**extra["notes"], **extra["others"], **changes})
-
-
-class Clash(NamedTuple):
-    """A setting, by its field, that says nothing, or the opposite of another one, `with_others` that are such. It
-    counts as given where it differs from its default; `why` completes "setting: ..." and says what to do."""
-
-    setting: str
-    with_others: Callable[[Any], object]
-    why: str
-
-
 @dataclass(frozen=True)
 class Setting:
-    """What the help and the docs say about one setting: all of `setting`, worked out where nothing was said (a default
-    of None is also that of one that is `required`), its `field` of the configuration, and its `name` in YAML."""
+    """What is declared of a setting; `settings` works out what is empty."""
 
-    field: str
-    name: str
-    flag: str
-    group: str
-    description: str
-    expects: str
-    unit: str
-    default: Any
-    otherwise: str
-    required: bool
-    metavar: str
-    form: Form
-    switched: str
-    power: Power
+    default: Any  # or a function that makes it; ... where it has to be given, which `settings` tells as None
+    group: str  # heading in the help
+    description: str  # what it is
+    expects: str = ""  # completes "expected ..." in errors, and names the range in the help; or type and constraints do
+    unit: str = ""  # of the value
+    otherwise: str = ""  # what a default of None comes to
+    flag: str = ""  # where that is not its name: "--control"
+    metavar: str = ""  # what stands for the value in the help, where that is not the last word of its name
+    form: Form = "text"  # how it is written on a command line; what is true or false is a switch
+    switched: str = ""  # what the flag does, where that is the opposite of the description
+    power: Power = none  # says what a value does beyond the run, which only a person may ask for (`settings.power`)
+    field: str = ""  # its name in the configuration
+    name: str = ""  # its name in YAML
+    required: bool = False
 
     @property
     def text(self) -> str:
@@ -116,27 +60,54 @@ class Setting:
         return f"{self.description}: {self.expects}{unit}" + (f" (default: {default})" if default else "")
 
 
+def setting(default: Any, group: str, description: str, expects: str = "", **more: Any) -> Any:
+    """Return a pydantic field: `more` are the others of `Setting` by name, and constraints of `pydantic.Field`."""
+    constraints = {name: more.pop(name) for name in ("alias", "ge", "gt", "le", "min_length") if name in more}
+    extra: Any = {"declared": Setting(default, group, description, expects, **more), "constraints": constraints}
+    make = {"default_factory": default} if callable(default) else {"default": default}
+    return Field(**make, description=description, json_schema_extra=extra, **constraints)
+
+
+def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
+    """Return a setting as another command declares it, but for some of the arguments of `setting`."""
+    extra: Any = config.model_fields[field].json_schema_extra
+    return setting(**{**vars(extra["declared"]), **extra["constraints"], **changes})
+
+
+class Clash(NamedTuple):
+    """A setting, by its field, that says nothing, or the opposite of another one, `with_others` that are such. It
+    counts as given where it differs from its default; `why` completes "setting: ..." and says what to do."""
+
+    setting: str
+    with_others: Callable[[Any], object]
+    why: str
+
+
 def settings(config: type[Config]) -> tuple[Setting, ...]:
     """Return every setting of a configuration, in the order in which they are shown."""
-    declared = []
+    complete = []
     for field, info in config.model_fields.items():
         if field in config.without:
             continue
         extra: Any = info.json_schema_extra
-        notes = {**extra["notes"]}
-        notes["flag"] = notes["flag"] or "--" + field.replace("_", "-")
-        notes["expects"] = notes["expects"] or _expected(info)
-        notes["metavar"] = notes["metavar"] or field.rpartition("_")[2].upper()
-        notes["form"] = "switch" if info.annotation is bool else notes["form"]
-        required, text = info.is_required(), info.description or ""
-        default = None if required else info.get_default(call_default_factory=True)
-        name = info.alias or field
-        declared.append(Setting(field, name, description=text, default=default, required=required, **notes))
-    return tuple(declared)
+        declared: Setting = extra["declared"]
+        complete.append(
+            replace(
+                declared,
+                field=field,
+                name=info.alias or field,
+                required=info.is_required(),
+                default=None if info.is_required() else info.get_default(call_default_factory=True),
+                flag=declared.flag or "--" + field.replace("_", "-"),
+                expects=declared.expects or _expected(info),
+                metavar=declared.metavar or field.rpartition("_")[2].upper(),
+                form="switch" if info.annotation is bool else declared.form,
+            )
+        )
+    return tuple(complete)
 
 
 def _expected(info: FieldInfo) -> str:
-    """What type and constraints of a field say of its values."""
     kinds = [kind for kind in get_args(info.annotation) or (info.annotation,) if kind is not type(None)]
     if kinds == [bool]:
         return "true or false"
@@ -175,12 +146,10 @@ def as_flags(setting: Setting, value: Any) -> list[str]:
 
 
 def _flow(value: Any) -> str:
-    """Return `value` as YAML on one line."""
     return str(yaml.safe_dump(value, default_flow_style=True, width=10**6, sort_keys=False)).strip()
 
 
 def _number(value: Any) -> str:
-    """Return a value as it is typed: 130 for 130.0, [0,0,1] for a list."""
     if isinstance(value, (list, tuple)):
         return "[" + ",".join(_number(part) for part in value) + "]"
     return repr(int(value)) if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 else str(value)
@@ -207,14 +176,10 @@ class SettingsError(InputError):
 
 class Config(BaseModel):
     """What a command needs to know. Frozen; unknown names are refused. Each command's configuration is a subclass.
-
-    Raises:
-        InputError: a value is outside its range or an unknown setting is named; the message lists every problem.
-    """
+    Raises InputError: a value is outside its range or an unknown setting is named; the message lists every problem."""
 
     command: ClassVar[str]
-    without: ClassVar[tuple[str, ...]] = ()
-    """Settings of a class above that the command does not have."""
+    without: ClassVar[tuple[str, ...]] = ()  # settings of a class above that the command does not have
     clashes: ClassVar[tuple[Clash, ...]] = ()
     formerly: ClassVar[Mapping[str, str]] = {}
     """Names that settings had before, with those of now; files and flags may still have them."""
@@ -239,7 +204,7 @@ class Config(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
-        """Refuse true for a number: YAML's `epsilon: yes` is a slip, not 1."""
+        # YAML's `epsilon: yes` is a slip, not 1
         if isinstance(value, bool) and cls.model_fields[info.field_name].annotation is not bool:
             raise ValueError("a truth value is not accepted here")
         return value
@@ -247,14 +212,12 @@ class Config(BaseModel):
     @field_validator("*")
     @classmethod
     def _finite(cls, value: Any) -> Any:
-        """Refuse NaN and infinity however deep they are, and whole numbers that no machine has."""
         if not written.all_finite(value):
             raise ValueError("not finite")
         return value
 
     @model_validator(mode="after")
     def _without_clashes(self) -> Self:
-        """Refuse what would be ignored, and settings that exclude each other."""
         defaults = {setting.field: setting.default for setting in settings(type(self))}
         for name in self.without:
             if getattr(self, name) != type(self).model_fields[name].get_default(call_default_factory=True):
@@ -295,12 +258,12 @@ class Config(BaseModel):
     @property
     def powers(self) -> tuple[LeftOut, ...]:
         """The settings that have power over more than the run."""
-        found = []
-        for setting in settings(type(self)):
-            value = getattr(self, setting.field)
-            if does := setting.power(value):
-                found.append(LeftOut(setting.name, setting.field, value, does, setting.default))
-        return tuple(found)
+        given = [(setting, getattr(self, setting.field)) for setting in settings(type(self))]
+        return tuple(
+            LeftOut(setting.name, setting.field, value, does, setting.default)
+            for setting, value in given
+            if (does := setting.power(value))
+        )
 
     @property
     def left_out(self) -> tuple[LeftOut, ...]:
@@ -314,21 +277,18 @@ class Config(BaseModel):
         return {
             setting.name: getattr(self, setting.field)
             for setting in settings(type(self))
-            if setting.power is not power.none and setting.name in self.free and setting.name not in PLACE
+            if setting.power is not none and setting.name in self.free and setting.name not in PLACE
         }
 
     def check_powers(self, where: str) -> None:
         """Refuse, by an InputError, settings with power over more than the run: `where` is a file that has them."""
-        for left_out in self.powers:
-            name, does = left_out.name, left_out.does
+        for name, _, _, does, _ in self.powers:
             raise InputError(f"{where}: {name}: {does}, which such a file can't ask for; leave it out")
 
     @classmethod
     def shared(cls, other: Config) -> dict[str, object]:
-        """Return the settings that this command and another's have from the same class, but for the run's place.
-
-        Who shares the work is part of that place.
-        """
+        """Return the settings that this command and another's have from the same class, but for the run's place. Who
+        shares the work is part of that place."""
         both = next(base for base in cls.__mro__ if issubclass(base, Config) and isinstance(other, base))
         apart = (*PLACE, "workers", "cluster", *cls.without, *other.without)
         return {name: getattr(other, name) for name in both.model_fields if name not in apart}
@@ -372,8 +332,9 @@ class Config(BaseModel):
 
     def to_repeat(self) -> Self:
         """Return what `run.yaml` holds: no place for the run (a repetition gets its own) and files by absolute path."""
-        places = {name: _absolute(getattr(self, name)) for name in FILES if name in type(self).model_fields}
-        return self.model_copy(update={**places, **PLACE})
+        named = {name: value for name in FILES if (value := getattr(self, name, None)) is not None}
+        absolute = {name: ",".join(map(_absolute, written.split_names(value))) for name, value in named.items()}
+        return self.model_copy(update={**absolute, **PLACE})
 
     def deciding(self) -> JsonObject:
         """Return the settings that decide a run's numbers, as JSON values: all that are not `free`. Files have their
@@ -388,9 +349,7 @@ class Config(BaseModel):
 
     def command_line(self) -> str:
         """Return the shell command that repeats this in a place of its own: all settings that are not the default.
-
-        Where there is no such command, it is a sentence that says so.
-        """
+        Where there is no such command, it is a sentence that says so."""
         if self._only_here:
             return f"No command repeats this: {self._in_words()}"
         words = ["advsearch", self.command]
@@ -401,14 +360,12 @@ class Config(BaseModel):
         return shlex.join(words)
 
     def _in_words(self) -> str:
-        """What only this Python session has, in a sentence."""
         *first, last = map(written.shown, self._only_here)
         listed = f"{', '.join(first)} and {last}" if first else last
         return f"{listed} {'exist' if first else 'exists'} only in the Python session that asked."
 
 
 def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:
-    """Return pydantic's findings (`ValidationError.errors`) as one error of ours: one problem a setting."""
     declared = settings(config)
     known = {each.name: each for each in declared} | {each.field: each for each in declared}
     problems: dict[str, str] = {}
@@ -423,15 +380,10 @@ def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchErr
     return SettingsError(tuple(problems.items()))
 
 
-def _absolute(value: str | None) -> str | None:
-    """Return the absolute path of `value` where it is a file, and the name it is otherwise; of a list, and of two files
-    as in ``camera.csv+object.csv``, each part."""
-    return None if value is None else ",".join(map(_absolute_file, written.split_names(value)))
-
-
-def _absolute_file(name: str) -> str:
+def _absolute(name: str) -> str:
+    # of two files as in camera.csv+object.csv, that of each; of what is no file, its name
     if len(both := split_paths(name)) > 1:
-        return "+".join(map(_absolute_file, both))
+        return "+".join(map(_absolute, both))
     path, mark, part = (name, "", "") if written.is_file(name) else name.partition("#")
     is_path = ("/" in path or Path(path).suffix != "") and written.is_file(path)
     return f"{Path(path).resolve()}{mark}{part}" if is_path else name

@@ -96,9 +96,7 @@ def number_or_text(value: Any) -> Any:
 
 def parse_assignment(text: str, where: str) -> tuple[str, Any]:
     """Return the name and the value of ``NAME=VALUE``; the value is read as YAML, and as plain text where it is none.
-
-    Raises InputError, which names `where` ("--set", say): there is no ``=``, or the name is empty.
-    """
+    Raises InputError, which names `where` ("--set", say): there is no ``=``, or the name is empty."""
     name, separator, value = text.partition("=")
     if not (separator and name.strip()):
         raise InputError(f"{where}: expected NAME=VALUE such as camera.azimuth=130, got {text!r}")
@@ -124,7 +122,6 @@ def read_controls(given: Iterable[str], where: str) -> dict[str, object]:
 
 
 def _parts(text: str) -> list[str]:
-    """Return what stands between the commas of a text that are in no brackets."""
     parts, depth, quote = [""], 0, ""
     for sign in text:
         if quote:
@@ -186,9 +183,9 @@ NAMED = ("policy", "task")  # the settings that are a name, or a `name` with opt
 
 def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, object]:
     """Return the mapping in the YAML file at `path`, laid over the files that its `base` names; `above` are those that
-    have named it as theirs. A base is a file, or a list of files of which a later one goes over an earlier one;
-    mappings are merged. Raises FileFormatError: the file is missing, empty, not text, not YAML or not a mapping with
-    names as keys."""
+    have named it as theirs. A base is a file, relative to this one, or a list of files of which a later one goes over
+    an earlier one; mappings are merged. Raises FileFormatError: the file is missing, empty, not text, not YAML or not a
+    mapping with names as keys."""
     try:
         data = parse_yaml(read_text(Path(path), "a YAML file", LARGEST))
     except OSError as error:
@@ -201,23 +198,18 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
     if data.get("schema", SCHEMA) not in range(OLDEST, SCHEMA + 1):
         got = shown(data["schema"])
         raise FileFormatError(f"{path}: expected schema {SCHEMA}, got {got}; it is of another advsearch")
-    return _with_base(data, Path(path), above)
-
-
-def _with_base(data: dict[str, object], path: Path, above: tuple[Path, ...]) -> dict[str, object]:
-    """Lay the settings over those of the files that their `base` names, relative to the file itself."""
     bases = data.pop("base", None) or []
     bases = [bases] if isinstance(bases, str) else bases
     if not isinstance(bases, list) or not all(isinstance(base, str) for base in bases):
         raise FileFormatError(f"{path}: base: expected a file or a list of files, got {shown(bases)}")
-    here = path.resolve()
+    here = Path(path).resolve()
     if len(above) >= MOST_BASES or len(bases) > MOST_BASES:
         raise FileFormatError(f"{path}: base: expected at most {MOST_BASES} files, one over the other, got more")
     if bases and here in above:
         raise FileFormatError(f"{path}: base: the file is a base of itself; take it out of one of them")
     result: dict[str, object] = {}
     for base in bases:
-        result = merged(result, read_yaml(path.parent / base, (*above, here)))
+        result = merged(result, read_yaml(Path(path).parent / base, (*above, here)))
     return merged(result, data)
 
 

@@ -39,7 +39,7 @@ def process_that(code: str) -> tuple[str, ...]:
 
 
 def test_json_is_one_value_with_every_part(well: None, capsys: pytest.CaptureFixture[str]) -> None:
-    assert doctor.DOCTOR.run(Namespace(json=True)) == 0
+    assert doctor.doctor.run(Namespace(json=True)) == 0
     answer = json.loads(capsys.readouterr().out)
     assert (answer["schema"], answer["command"], answer["ok"]) == (1, "doctor", True)
     assert all(set(part) == {"name", "version", "status", "detail", "fix"} for part in answer["parts"])
@@ -49,7 +49,7 @@ def test_json_is_one_value_with_every_part(well: None, capsys: pytest.CaptureFix
 
 
 def test_table_names_every_part_and_says_that_all_is_well(well: None, capsys: pytest.CaptureFixture[str]) -> None:
-    assert doctor.DOCTOR.run(Namespace(json=False)) == 0
+    assert doctor.doctor.run(Namespace(json=False)) == 0
     text = capsys.readouterr().out
     assert all(name in text for name in ("numpy", "torch", "render", "libLLVM", "bundled scenes"))
     assert "Everything that is necessary works." in text
@@ -59,7 +59,7 @@ def test_a_part_that_does_not_work_is_told_with_what_to_do_and_status_3(
     well: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(doctor, "run_probe", lambda: ALL_WELL | {"xatlas": (False, "ImportError: no such file")})
-    assert doctor.DOCTOR.run(Namespace(json=False)) == 3
+    assert doctor.doctor.run(Namespace(json=False)) == 3
     text = capsys.readouterr().out
     assert "broken" in text and "ImportError: no such file" in text
     assert "xatlas: pip install --force-reinstall --no-deps xatlas" in text
@@ -70,7 +70,7 @@ def test_a_missing_optional_part_is_a_warning(
     well: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(doctor, "installed_version", lambda name: None if name == "pyarrow" else "1.0")
-    assert doctor.DOCTOR.run(Namespace(json=True)) == 0
+    assert doctor.doctor.run(Namespace(json=True)) == 0
     (part,) = (p for p in json.loads(capsys.readouterr().out)["parts"] if p["name"] == "pyarrow")
     assert part["status"] == "warning" and "Parquet" in part["detail"]
 
@@ -106,10 +106,10 @@ def test_a_process_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_llvm_tells_which_was_chosen_and_why_others_were_not(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen, other = Path("/lib/libLLVM.so.19.1"), Path("/lib/libLLVM-15.so.1")
-    candidates = [llvm.LibraryFile(chosen, (19, 1), ""), llvm.LibraryFile(other, (15,), llvm.refusal((15,)))]
+    candidates = [llvm.LibraryFile(chosen, (19, 1)), llvm.LibraryFile(other, (15,), llvm.refusal((15,)))]
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
     monkeypatch.setattr(llvm, "find", lambda: candidates)
-    monkeypatch.setattr(llvm, "ensure_llvm", lambda: llvm.LLVM(chosen, (19, 1)))
+    monkeypatch.setattr(llvm, "ensure_llvm", lambda: llvm.LibraryFile(chosen, (19, 1)))
     part = doctor.check_llvm()
     assert (part.version, part.status, part.fix) == ("19.1", doctor.OK, "")
     assert f"chosen: {chosen}" in part.detail

@@ -19,7 +19,7 @@ from advsearch.scene.mitsuba_backend.meshes import loadable, principled
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, mesh_translation, translation
 from advsearch.scene.mitsuba_backend.variant import mi
 from advsearch.scene.parts import PluginNumber, PluginNumbers
-from advsearch.scene.raster import texel_positions
+from advsearch.scene.raster import rasterised
 from advsearch.scene.settings import CHANNELS
 
 BASE_COLOR = "object.base_color"
@@ -66,7 +66,8 @@ def test_a_pattern_has_one_scale_on_the_object_whatever_its_charts(scene: SceneD
     """Texels that lie far apart in the texture and at one place on the object have one colour."""
     mesh = scene.object.mesh
     texels = covering(mesh, "checker", 128)
-    positions, normals, _ = texel_positions(mesh, 128)
+    charts = rasterised(mesh, 128)
+    positions, normals = charts.positions(), charts.normals()
     flat = np.abs(normals[..., 2]) > 0.98  # seen from above only: the floor, the foot
     cell = PATTERNS["checker"].size / 4.0
     inside = (np.abs(positions[..., :2] / cell % 1.0 - 0.5) < 0.4).all(axis=-1) & flat

@@ -21,7 +21,7 @@ from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.library import list_objects, load_object
-from advsearch.scene.raster import MeshSurface, rasterised, texel_area, texel_positions
+from advsearch.scene.raster import MeshSurface, rasterised
 
 SIDE = 512
 
@@ -34,8 +34,8 @@ def scene() -> SceneDescription:
 @pytest.fixture(scope="module")
 def surface(scene: SceneDescription) -> tuple[Floats, Floats, Floats]:
     """Positions, normals and areas of the texels of the mug."""
-    positions, normals, _ = texel_positions(scene.object.mesh, SIDE)
-    return positions, normals, texel_area(scene.object.mesh, SIDE)
+    charts = rasterised(scene.object.mesh, SIDE)
+    return charts.positions(), charts.normals(), charts.areas()
 
 
 def bound(scene: SceneDescription, **settings: Any) -> PatchControl:
@@ -72,7 +72,8 @@ def test_texels_know_their_place_on_every_object(name: str) -> None:
 
 
 def test_texels_beside_a_chart_continue_it(scene: SceneDescription) -> None:
-    positions, normals, mask = texel_positions(scene.object.mesh, 256)
+    charts = rasterised(scene.object.mesh, 256)
+    positions, normals, mask = charts.positions(), charts.normals(), charts.touched
     assert positions.shape == normals.shape == (256, 256, 3) and mask.shape == (256, 256)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1.0, atol=1e-4)
     charts = rasterised(scene.object.mesh, 256)
@@ -86,7 +87,7 @@ def test_texture_coordinates_without_area_are_refused(scene: SceneDescription) -
 
     empty = replace(scene.object.mesh, uvs=np.full_like(scene.object.mesh.uvs, 2.0))
     with pytest.raises(InputError, match="none of the 64 x 64 texels lies in a triangle; unwrap the mesh again"):
-        texel_positions(empty, 64)
+        rasterised(empty, 64)
 
 
 def test_a_ray_meets_the_near_wall_and_a_ray_that_misses_the_nearest_corner(scene: SceneDescription) -> None:
@@ -104,7 +105,7 @@ def test_the_patch_has_its_size_on_the_surface(scene: SceneDescription) -> None:
     for size in (0.1, 0.3, 0.5):
         control = bound(scene, azimuth=180.0, height=0.5, size=size)
         share = covered(control)
-        area = float((share * texel_area(scene.object.mesh, len(share))).sum())
+        area = float((share * rasterised(scene.object.mesh, len(share)).areas()).sum())
         assert area == pytest.approx(size**2, rel=0.04)
 
 

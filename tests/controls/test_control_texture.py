@@ -15,7 +15,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import texel_area
+from advsearch.scene.raster import rasterised
 
 EIGHT_BIT = 1e-4
 """Colours may differ by this much after the way to linear values and back."""
@@ -108,7 +108,7 @@ def test_a_palette_repaints_what_resembles_its_colour() -> None:
 
 def test_the_palette_is_that_of_the_surface_and_never_by_chance(scene: SceneDescription) -> None:
     own = torch.from_numpy(scene.object.base_color.copy())
-    area = texel_area(scene.object.mesh, len(own))
+    area = rasterised(scene.object.mesh, len(own)).areas()
     first = palette(own, area, 6)
     assert torch.equal(first, palette(own, area, 6)) and first.shape == (6, 3)
     cream, blue = torch.tensor([0.90, 0.85, 0.78]), torch.tensor([0.14, 0.37, 0.58])

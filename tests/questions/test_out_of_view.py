@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import small_models
 
 import advsearch
 from advsearch.attacks import clopper_pearson
+from advsearch.errors import InputError
 from advsearch.questions.report.evidence import conditions_of
 from advsearch.questions.sweep.display import distance_of
 from advsearch.questions.sweep.result import Predictions
+from advsearch.registry import allow_code
 from advsearch.runs.summary import read_result
 from advsearch.tasks import Judgement, Prediction
+from advsearch.testing import assert_no_worse, assert_suite
 from advsearch.viewer.columns import UNKNOWN, packed, read_columns
 
 pytestmark = pytest.mark.usefixtures("two_threads")
@@ -62,3 +66,35 @@ def test_pairs_of_a_comparison_are_of_pictures_that_show_it(tmp_path: Path) -> N
         )  # fmt: skip
     paired = advsearch.compare(f"{tmp_path / 'one'},{tmp_path / 'other'}", pictures=0, run=tmp_path / "both")
     assert [side.configurations for side in paired.sides] == [1, 1]
+
+
+DETECTED: dict[str, Any] = {"task": "detection", "label": "car", "verify_spp": 1, "denoise": "none"}
+BESIDE = {"pose": {"y": [40.0, 60.0]}}  # never in the picture
+
+
+def test_claims_count_pictures_that_show_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model that is "right" where there is nothing to see would be shown to be no worse, and to be steady."""
+    monkeypatch.chdir(tmp_path)
+    some: dict[str, Any] = {"pictures": 32, "confidence": 0.6, "controls": BESIDE, **DETECTED}
+    hidden = r"undecided: no picture.*; the object is not to be seen in 32 more"
+    with pytest.raises(AssertionError, match=hidden):
+        assert_no_worse("mug", small_models.finds_cars(), small_models.finds_cars(), points=90.0, **some)
+    steady = {"claim": "must_not_change", "when": "exposure", "at_least": 0.2, "pictures": 32}
+    allow_code("small_models:finds_cars")
+    settings = {"object": "mug", "model": "small_models:finds_cars", "controls": BESIDE, **DETECTED}
+    Path("suite.yaml").write_text(
+        json.dumps({"title": "steady", "settings": settings, "confidence": 0.6, "claims": {"steady": steady}})
+    )
+    with pytest.raises(AssertionError, match=f"steady: {hidden}"):
+        assert_suite("suite.yaml")
+
+
+def test_a_region_ends_where_the_object_leaves_the_picture(tmp_path: Path) -> None:
+    """A detector that is right about the object cannot be wrong where it is not, and the box would take all of that."""
+    small: dict[str, Any] = {"samples": 20, "set": {"camera.distance": 0.4}, "exposure": -3.0, **DETECTED}
+    model = small_models.finds_cars()
+    found = advsearch.region("mug", model, controls={"pose": {"y": [-3.0, 3.0]}}, run=tmp_path / "run", **small)
+    assert found.verdict == "right" and found.box is not None and found.same == found.samples
+    assert -1.0 < found.box[0].low < found.box[0].high < 1.0, found.box
+    with pytest.raises(InputError, match=r"the object is not to be seen in 20 of 20 trials at the centre"):
+        advsearch.region("mug", model, controls=BESIDE, run=tmp_path / "none", **small)

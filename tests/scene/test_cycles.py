@@ -71,7 +71,7 @@ def by_cycles(scene: SceneDescription) -> Cycles:
 def test_blender_gets_the_scene_as_it_is(folder: Path, renderer: Renderer) -> None:
     u = torch.full_like(renderer.start, 0.7)
     made = by_cycles(renderer.scene.made[0])
-    theirs = renderer.rendered_by(made.radiance)
+    theirs = renderer.like(source=made.radiance)
     first, again = (theirs.radiance(u, seed, 4) for seed in (1, 2))
     assert first.shape == (8, 12, 3) and not torch.equal(first, again) and theirs.renders == 2
     told = json.loads((folder / "scene.json").read_text())

@@ -11,28 +11,10 @@ from itertools import pairwise, product
 
 import numpy as np
 
+import advsearch.bundled.objects.shapes as shapes
 from advsearch.bundled.objects.draw import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family
-from advsearch.bundled.objects.shapes import (
-    Array,
-    Field,
-    Patch,
-    away_from,
-    box,
-    cap,
-    carved,
-    grid,
-    lathe,
-    mean_lengths,
-    placed,
-    rectangle,
-    rotation,
-    rounded,
-    spline,
-    stretched,
-    sweep,
-    unit,
-)
+from advsearch.bundled.objects.shapes import Array, Patch
 from advsearch.bundled.objects.textures import Paint, Texels, mix, painter, solid, step
 from advsearch.scene.assets import Material
 
@@ -77,20 +59,20 @@ def _shell(rows: Array, power: float, middle: float, height: Height, corner: flo
         row[:, 0], row[:, 1], row[:, 2] = x, y, height(np.full_like(x, share), x, y)
     around = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
     across = np.gradient(around, axis=1)[:, 1:-1]
-    normals = unit(np.cross(across, np.gradient(points, axis=0)))
+    normals = shapes.unit(np.cross(across, np.gradient(points, axis=0)))
     opposite, cut = COLUMNS // 2, int(COLUMNS * corner)
     patches = []
     for first, last in pairwise((0, cut, opposite - cut, opposite + cut, COLUMNS - cut, COLUMNS)):
         part = points[:, first : last + 1]
-        u, v = (mean_lengths(part, axis) for axis in (1, 0))
+        u, v = (shapes.mean_lengths(part, axis) for axis in (1, 0))
         size = (float(u[-1]), float(v[-1]))
-        patches.append(grid("paint", part, normals[:, first : last + 1], size, v / v[-1], u / u[-1]))
+        patches.append(shapes.grid("paint", part, normals[:, first : last + 1], size, v / v[-1], u / u[-1]))
     return patches
 
 
 def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
     """A smooth function through knots (x, value) in order of x."""
-    curve = spline(knots, 200)
+    curve = shapes.spline(knots, 200)
     return lambda x: np.interp(x, curve[:, 0], curve[:, 1])
 
 
@@ -138,102 +120,73 @@ _CABIN = [
 _BODY_POWER, _CABIN_POWER = 4.2, 4.6
 
 
+def _deck(x: Array, y: Array) -> Array:
+    """The height at which the body ends and the cabin begins."""
+    return np.asarray(_WAIST(x) + 0.045 * (1.0 - (y / 0.8) ** 2))
+
+
 def _body_height(share: Array, x: Array, y: Array) -> Array:
-    top, low = _WAIST(x) + 0.045 * (1.0 - (y / 0.8) ** 2), _BOTTOM(x)
-    return np.asarray(low + share * (top - low))
+    return np.asarray(_BOTTOM(x) + share * (_deck(x, y) - _BOTTOM(x)))
 
 
 def _cabin_height(share: Array, x: Array, y: Array) -> Array:
-    low = _WAIST(x) + 0.045 * (1.0 - (y / 0.8) ** 2) - 0.03
+    low = _deck(x, y) - 0.03
     return np.asarray(low + share * (_ROOF(x) + 0.035 * (1.0 - (y / 0.6) ** 2) - low))
 
 
-def _within(front: float, rear: float, half: float, power: float, middle: float) -> Field:
-    """Inside an outline, whatever the height."""
-
-    def inside(p: Array) -> Array:
-        reach = np.where(p[:, 0] >= middle, front - middle, middle - rear)
-        size = (np.abs((p[:, 0] - middle) / reach) ** power + np.abs(p[:, 1] / half) ** power) ** (1 / power)
-        return np.asarray(half * (1.0 - size))
-
-    return inside
-
-
-def _arch(axle: float) -> Field:
-    return lambda p: np.where(np.abs(p[:, 1]) > 0.4, ARCH - np.hypot(p[:, 0] - axle, p[:, 2] - WHEEL), -1.0)
-
-
-def _headlight(p: Array) -> Array:
-    out = np.abs(p[:, 1]) - 0.42
-    low, high = 0.565 + 0.1 * out, 0.665 + 0.2 * out
-    return np.where(p[:, 0] > 1.2, _softest(out, p[:, 0] - 1.66, p[:, 2] - low, high - p[:, 2]), -1.0)
-
-
-def _taillight(p: Array) -> Array:
-    out = np.abs(p[:, 1]) - 0.40
-    return np.where(p[:, 0] < -1.0, _softest(out, -1.80 - p[:, 0], p[:, 2] - 0.785, 0.955 - p[:, 2]), -1.0)
-
-
-def _grille(half: float, low: float, high: float, lean: float = 0.0) -> Field:
-    def inside(p: Array) -> Array:
-        out = np.abs(p[:, 1])
-        hole = _softest(half - out, p[:, 2] - low - lean * out, high + lean * out - p[:, 2])
-        return np.where(p[:, 0] > 1.5, hole, -1.0)
-
-    return inside
-
-
-def _valance(p: Array) -> Array:
-    """The dark lower edge all round, higher at the back."""
-    return _BOTTOM(p[:, 0]) + np.where(p[:, 0] < -1.6, 0.13, 0.075) - p[:, 2]
-
-
-def _half(z: Array) -> Array:
-    """About half the cabin's width at a height."""
-    return np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])
-
-
-def _windscreen(p: Array) -> Array:
-    inside = _softest(0.85 * _half(p[:, 2]) - np.abs(p[:, 1]), 1.36 - p[:, 2])
-    return np.where(p[:, 0] > 0.0, inside, -1.0)
-
-
-def _rear_window(p: Array) -> Array:
-    inside = _softest(0.86 * _half(p[:, 2]) - np.abs(p[:, 1]), p[:, 2] - 1.045, 1.325 - p[:, 2])
-    return np.where(p[:, 0] < -1.5, inside, -1.0)
-
-
-def _side_windows(p: Array) -> Array:
-    x, z = p[:, 0], p[:, 2]
-    low = _WAIST(x) + 0.04
-    high = low + 0.83 * (_ROOF(x) - low)
+def _inside(p: Array) -> dict[str, Array]:
+    """About how far points of the body and the cabin lie inside each of `OPENINGS`."""
+    x, y, z = p.T
+    out = np.abs(y)
+    reach = np.where(x >= MIDDLE, 0.9 - MIDDLE, MIDDLE + 1.86)
+    size = (np.abs((x - MIDDLE) / reach) ** _CABIN_POWER + np.abs(y / 0.72) ** _CABIN_POWER) ** (1 / _CABIN_POWER)
+    half = np.interp(z, [0.93, 1.15, 1.36], [0.795, 0.735, 0.668])  # about half the cabin's width
+    sill = _WAIST(x) + 0.04
+    lintel = sill + 0.83 * (_ROOF(x) - sill)
     pillar = (0.60 - x) * 0.58 - (z - 0.93) * 0.81  # distance behind the line of the windscreen's pillar
     rear = (x + 1.62) * 0.72 - (z - 0.98) * 0.69
-    return np.where(np.abs(p[:, 1]) > 0.45, _softest(pillar, rear, z - low, high - z), -1.0)
+    lamp = out - 0.42
+    lens = _softest(lamp, x - 1.66, z - (0.565 + 0.1 * lamp), 0.665 + 0.2 * lamp - z)
+    low_grille = _softest(0.62 - out, z - 0.24 + 0.02 * out, 0.37 - 0.02 * out - z)
+    high_grille = _softest(0.41 - out, z - 0.5 - 0.04 * out, 0.64 + 0.04 * out - z)
+    arches = [np.where(out > 0.4, ARCH - np.hypot(x - axle, z - WHEEL), -1.0) for axle in AXLES]
+    return {
+        "cabin": 0.72 * (1.0 - size),
+        "front arch": arches[0],
+        "rear arch": arches[1],
+        "headlight": np.where(x > 1.2, lens, -1.0),
+        "taillight": np.where(x < -1.0, _softest(out - 0.40, -1.80 - x, z - 0.785, 0.955 - z), -1.0),
+        "low grille": np.where(x > 1.5, low_grille, -1.0),
+        "high grille": np.where(x > 1.5, high_grille, -1.0),
+        "valance": _BOTTOM(x) + np.where(x < -1.6, 0.13, 0.075) - z,  # the dark lower edge, higher at the back
+        "windscreen": np.where(x > 0.0, _softest(0.85 * half - out, 1.36 - z), -1.0),
+        "rear window": np.where(x < -1.5, _softest(0.86 * half - out, z - 1.045, 1.325 - z), -1.0),
+        "side windows": np.where(out > 0.45, _softest(pillar, rear, z - sill, lintel - z), -1.0),
+    }
 
 
-CARVED: tuple[tuple[Field, str | None], ...] = (
-    (_within(0.9, -1.86, 0.72, _CABIN_POWER, MIDDLE), None),
-    *((_arch(axle), None) for axle in AXLES),
-    (_headlight, "headlight"),
-    (_taillight, "taillight"),
-    (_grille(0.62, 0.24, 0.37, -0.02), "trim"),
-    (_grille(0.41, 0.5, 0.64, 0.04), "trim"),
-    (_valance, "trim"),
-)
-"""What is carved out of the body, and what it becomes."""
+OPENINGS: dict[str, dict[str, str | None]] = {
+    "body": {
+        "cabin": None, "front arch": None, "rear arch": None, "headlight": "headlight", "taillight": "taillight",
+        "low grille": "trim", "high grille": "trim", "valance": "trim",
+    },
+    "cabin": dict.fromkeys(("windscreen", "rear window", "side windows"), "glass"),
+}  # fmt: skip
+"""What is carved out of the body and out of the cabin, and what it becomes."""
 
 
 def _body_and_cabin() -> list[Patch]:
     deck = [(1.0, s * 0.78, s * 1.79, s * -1.965) for s in (0.92, 0.81, 0.69, 0.56, 0.43)]
-    body = _shell(np.array([*spline(_BODY, 23), *deck]), _BODY_POWER, 0.0, _body_height, 0.085)
-    for inside, tag in CARVED:
-        body = carved(body, inside, tag)
     roof = [(1.0, s * 0.5, MIDDLE + s * 0.28, MIDDLE - s * 0.8) for s in (0.75, 0.45, 0.15, 0.002)]
-    cabin = _shell(np.array([*spline(_CABIN, 16), *roof]), _CABIN_POWER, MIDDLE, _cabin_height, 0.1)
-    for window in (_windscreen, _rear_window, _side_windows):
-        cabin = carved(cabin, window, "glass")
-    return body + cabin
+    body, cabin = np.array([*shapes.spline(_BODY, 23), *deck]), np.array([*shapes.spline(_CABIN, 16), *roof])
+    parts = {
+        "body": _shell(body, _BODY_POWER, 0.0, _body_height, 0.085),
+        "cabin": _shell(cabin, _CABIN_POWER, MIDDLE, _cabin_height, 0.1),
+    }
+    for part, openings in OPENINGS.items():
+        for name, tag in openings.items():
+            parts[part] = shapes.carved(parts[part], lambda p, name=name: _inside(p)[name], tag)  # type: ignore[misc]
+    return parts["body"] + parts["cabin"]
 
 
 # --------------------------------------------------------------------------------------------------------- wheels
@@ -246,23 +199,25 @@ def _wheel() -> list[Patch]:
     tread = [(WHEEL, half - 0.05), (WHEEL, 0.0), (WHEEL, 0.05 - half)]
     tyre = [*((r, -z) for r, z in outside), *tread[::-1], *outside[::-1]]
     deep = half - 0.06
-    patches = lathe([("rubber", tyre)], 28)
-    patches += lathe([("rim", [(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)])], 28)
-    patches += lathe([("well", [(rim - 0.02, deep), (0.0, deep)])], 24)
+    patches = shapes.lathe([("rubber", tyre)], 28)
+    patches += shapes.lathe([("rim", [(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)])], 28)
+    patches += shapes.lathe([("well", [(rim - 0.02, deep), (0.0, deep)])], 24)
     spoke = np.array([(0.03, 0.0, half - 0.035), (0.11, 0.0, half - 0.022), (rim - 0.012, 0.0, half - 0.018)])
-    section = rectangle(0.03, 0.03, 0.008, 1)
+    section = shapes.rectangle(0.03, 0.03, 0.008, 1)
     for number, side in product(range(5), (-1.0, 1.0)):
         spoke[:, 1] = side * np.array([0.012, 0.018, 0.04])
-        patches += placed(sweep("rim", spoke, section, (1.0, 1.0, 1.15)), rotation("z", 72.0 * number))
+        patches += shapes.placed(
+            shapes.sweep("rim", spoke, section, (1.0, 1.0, 1.15)), shapes.rotation("z", 72.0 * number)
+        )
     hub = [(0.052, deep), (0.05, half - 0.02), (0.03, half - 0.01), (0.0, half - 0.008)]
-    return patches + lathe([("rim", rounded(hub, 0.008, 2))], 20)
+    return patches + shapes.lathe([("rim", shapes.rounded(hub, 0.008, 2))], 20)
 
 
 def _wheels() -> list[Patch]:
     patches = []
     for axle, side in WHEELS:
-        turn = rotation("y", 17.0 * axle) @ rotation("x", -90.0 * side)
-        patches += placed(_wheel(), turn, (axle, side * (0.852 - TYRE / 2), WHEEL))
+        turn = shapes.rotation("y", 17.0 * axle) @ shapes.rotation("x", -90.0 * side)
+        patches += shapes.placed(_wheel(), turn, (axle, side * (0.852 - TYRE / 2), WHEEL))
     return patches
 
 
@@ -279,10 +234,10 @@ def _wells() -> list[Patch]:
             rows, ring = rows[::-1], ring[::-1]
         normals = np.broadcast_to(-outwards, rows.shape)
         across = np.linspace(0.0, 1.0, len(angle))
-        patches.append(grid("well", rows, normals, (ARCH * 4.2, 0.32), np.array([0.0, 1.0]), across))
-        patches.append(cap("well", ring, np.array([0.0, side, 0.0])))
+        patches.append(shapes.grid("well", rows, normals, (ARCH * 4.2, 0.32), np.array([0.0, 1.0]), across))
+        patches.append(shapes.cap("well", ring, np.array([0.0, side, 0.0])))
     x, y = _outline(np.linspace(np.pi, -np.pi, 41)[:-1], 1.97, -1.99, 0.79, _BODY_POWER, 0.0)
-    return [*patches, cap("well", np.stack([x, y, np.full_like(x, 0.2)], axis=1), np.array([0.0, 0.0, -1.0]))]
+    return [*patches, shapes.cap("well", np.stack([x, y, np.full_like(x, 0.2)], axis=1), np.array([0.0, 0.0, -1.0]))]
 
 
 # ------------------------------------------------------------------------------------------------------- fittings
@@ -291,22 +246,22 @@ def _wells() -> list[Patch]:
 def _fittings() -> list[Patch]:
     patches = []
     for side in (1.0, -1.0):  # mirrors
-        shell = box("paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), 0.055, 3)
-        patches += placed(shell, rotation("z", -14.0 * side), (0.57, side * 0.93, 1.005))
-        patches += box("trim", (0.58, side * 0.83, 0.955), (0.06, 0.14, 0.035), 0.012, 1)
-    plate = box("plate", (0, 0, 0), (0.014, 0.52, 0.112), 0.004, 1)
-    badge = lathe([("rim", [(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)])], 24)
+        shell = shapes.box("paint", (0.0, 0.0, 0.0), (0.12, 0.2, 0.125), 0.055, 3)
+        patches += shapes.placed(shell, shapes.rotation("z", -14.0 * side), (0.57, side * 0.93, 1.005))
+        patches += shapes.box("trim", (0.58, side * 0.83, 0.955), (0.06, 0.14, 0.035), 0.012, 1)
+    plate = shapes.box("plate", (0, 0, 0), (0.014, 0.52, 0.112), 0.004, 1)
+    badge = shapes.lathe([("rim", [(0.058, -0.02), (0.058, 0.006), (0.05, 0.012), (0.0, 0.014)])], 24)
     for thing, lean, place in (
         (plate, -4.0, (2.146, 0.0, 0.428)),
         (plate, 3.0, (-2.138, 0.0, 0.705)),
         (badge, 78.0, (2.118, 0.0, 0.575)),
         (badge, -80.0, (-2.075, 0.0, 0.86)),
     ):
-        patches += placed(thing, rotation("y", lean), place)
+        patches += shapes.placed(thing, shapes.rotation("y", lean), place)
     for side, x in product((1.0, -1.0), (0.05, -0.92)):  # handles of the doors
-        patches += box("paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1)
-    spoiler = box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2)
-    return [*patches, *placed(spoiler, rotation("y", 9.0), (-1.60, 0.0, 1.364))]
+        patches += shapes.box("paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1)
+    spoiler = shapes.box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2)
+    return [*patches, *shapes.placed(spoiler, shapes.rotation("y", 9.0), (-1.60, 0.0, 1.364))]
 
 
 # --------------------------------------------------------------------------------------------------------- paints
@@ -324,15 +279,15 @@ def _lacquer(t: Texels, color: Array) -> Array:
     """Paint with the gaps of doors, hood and tailgate."""
     x, y, z = t.xyz.T
     out = np.abs(y)
-    hood = away_from(x, out, [(0.9, 0.74), (1.5, 0.70), (1.84, 0.58), (1.95, 0.3), (1.97, 0.0)])
-    gate = away_from(out, z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)])
+    hood = shapes.away_from(x, out, [(0.9, 0.74), (1.5, 0.70), (1.84, 0.58), (1.95, 0.3), (1.97, 0.0)])
+    gate = shapes.away_from(out, z, [(0.66, 1.2), (0.70, 0.98), (0.62, 0.66), (0.55, 0.58), (0.0, 0.57)])
     gaps = [
-        np.where((out > 0.6) & (z < 1.02), away_from(x, z, *_DOORS), 9.0),
+        np.where((out > 0.6) & (z < 1.02), shapes.away_from(x, z, *_DOORS), 9.0),
         np.where((x > 0.8) & (z > 0.6), hood, 9.0),
         np.where(x < -1.7, gate, 9.0),
         np.where((y < -0.6) & (x < -1.0), np.abs(np.hypot(x + 1.52, z - 0.80) - 0.075), 9.0),  # the tank's lid
     ]
-    fold = np.clip(1.0 - away_from(x, out, [(0.95, 0.5), (1.9, 0.36)]) / 0.05, 0.0, 1.0)
+    fold = np.clip(1.0 - shapes.away_from(x, out, [(0.95, 0.5), (1.9, 0.36)]) / 0.05, 0.0, 1.0)
     shaded = mix(color, 0.75 * color, 0.4 * np.where((x > 0.8) & (z > 0.7), fold, 0.0))
     return mix(shaded, 0.12 * color, 0.9 * step(0.005 - np.min(gaps, axis=0), 0.0, 0.011))
 
@@ -412,4 +367,4 @@ def car(draw: Draw) -> Instance:
         "well": solid("0a0a0b"),
     }
     detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
-    return Instance(stretched(patches, stretch), paints, FINISHES["paint"], detail, FINISHES)
+    return Instance(shapes.stretched(patches, stretch), paints, FINISHES["paint"], detail, FINISHES)

@@ -77,22 +77,6 @@ def pack(sizes: Sequence[tuple[float, float]], side: int = SIZE) -> list[AtlasPl
     return [replace(place, turned=h > w) for place, (w, h) in zip(best, exact, strict=True)]
 
 
-def _chart(place: AtlasPlace) -> tuple[Array, Array]:
-    """Chart coordinates (u, v) of every texel of a place, row by row from the bottom, clamped in the gutter."""
-    a = np.clip((np.arange(place.width) + 0.5 - GUTTER) / (place.width - 2 * GUTTER), 0.0, 1.0)
-    b = np.clip((np.arange(place.height) + 0.5 - GUTTER) / (place.height - 2 * GUTTER), 0.0, 1.0)
-    a, b = np.broadcast_to(a, (place.height, place.width)).ravel(), np.repeat(b, place.width)
-    return (b, 1.0 - a) if place.turned else (a, b)
-
-
-def _in_atlas(place: AtlasPlace, uvs: Array, side: int) -> Array:
-    """Atlas coordinates in [0, 1] of chart coordinates (V, 2)."""
-    local = np.stack([1.0 - uvs[:, 1], uvs[:, 0]], axis=1) if place.turned else uvs
-    inner = np.array([place.width - 2 * GUTTER, place.height - 2 * GUTTER])
-    places: Array = (np.array([place.x, place.y]) + GUTTER + local * inner) / side
-    return places
-
-
 def painted(
     patches: Sequence[Patch], places: Sequence[AtlasPlace], paints: Mapping[str, Paint], side: int = SIZE
 ) -> npt.NDArray[np.float32]:
@@ -100,7 +84,12 @@ def painted(
     image = np.zeros((side, side, 3))
     used = np.zeros((side, side), dtype=bool)
     for patch, place in zip(patches, places, strict=True):
-        u, v = _chart(place)
+        a, b = (  # of every texel, row by row from the bottom, clamped in the gutter
+            np.clip((np.arange(count) + 0.5 - GUTTER) / (count - 2 * GUTTER), 0.0, 1.0)
+            for count in (place.width, place.height)
+        )
+        a, b = np.tile(a, place.height), np.repeat(b, place.width)
+        u, v = (b, 1.0 - a) if place.turned else (a, b)
         color = paints[patch.tag](Texels(patch.rest(u, v), u, v, patch.size))
         area = np.s_[place.y : place.y + place.height, place.x : place.x + place.width]
         image[area] = color.reshape(place.height, place.width, 3)
@@ -118,11 +107,16 @@ def joined(patches: Sequence[Patch], places: Sequence[AtlasPlace], side: int = S
     origin, extent = footing(vertices)
     vertices = (vertices - origin) / extent
     normals = np.concatenate([p.normals for p in patches])
-    uvs = np.concatenate([_in_atlas(place, p.uvs, side) for p, place in zip(patches, places, strict=True)])
+    uvs = []
+    for patch, place in zip(patches, places, strict=True):
+        local = np.stack([1.0 - patch.uvs[:, 1], patch.uvs[:, 0]], axis=1) if place.turned else patch.uvs
+        inner = np.array([place.width - 2 * GUTTER, place.height - 2 * GUTTER])
+        uvs.append((np.array([place.x, place.y]) + GUTTER + local * inner) / side)
     faces = np.concatenate([p.faces + start for p, start in zip(patches, starts, strict=True)])
     used = np.unique(faces)  # poles leave vertices behind that no triangle needs
     renumbered = np.searchsorted(used, faces).astype(np.uint32)
-    return Mesh(_exact(vertices[used]), renumbered, _exact(normals[used]), _exact(np.clip(uvs[used], 0.0, 1.0)))
+    corners = np.clip(np.concatenate(uvs)[used], 0.0, 1.0)
+    return Mesh(_exact(vertices[used]), renumbered, _exact(normals[used]), _exact(corners))
 
 
 def _exact(values: Array) -> npt.NDArray[np.float32]:

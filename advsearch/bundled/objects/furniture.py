@@ -6,23 +6,10 @@ from itertools import product
 
 import numpy as np
 
+import advsearch.bundled.objects.shapes as shapes
 from advsearch.bundled.objects.draw import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family, finish
-from advsearch.bundled.objects.shapes import (
-    Array,
-    Patch,
-    box,
-    dense,
-    ellipse,
-    lathe,
-    placed,
-    rectangle,
-    rotation,
-    rounded,
-    sphere,
-    spline,
-    sweep,
-)
+from advsearch.bundled.objects.shapes import Array, Patch
 from advsearch.bundled.objects.textures import (
     Paint,
     between,
@@ -48,7 +35,7 @@ def _post(tag: str, low: Place, high: Place, section: Array, ends: tuple[float, 
     path = np.array(low) + t[:, None] * (np.array(high) - np.array(low))
     scale = (ends[0] + (ends[1] - ends[0]) * t) * np.array([0.9, 1.0, 1.0, 1.0, 0.9])
     lying = abs(high[0] - low[0]) > abs(high[2] - low[2])
-    return sweep(tag, path, section, scale, first=(0.0, 0.0, 1.0) if lying else (1.0, 0.0, 0.0), caps=True)
+    return shapes.sweep(tag, path, section, scale, first=(0.0, 0.0, 1.0) if lying else (1.0, 0.0, 0.0), caps=True)
 
 
 @family(metres=0.01)
@@ -59,16 +46,16 @@ def chair(draw: Draw) -> Instance:
     thick, leg = draw(3.6, 2.4, 5.5), draw(2.1, 1.5, 3.0)
     splay, lean = draw(1.5, 0.0, 6.0), draw(5.0, 1.0, 11.0)
     square = draw.chance(0.5, True)
-    section = rectangle(2.0, 2.0, 0.5, 2) if square else ellipse(1.0, 1.0, 16)
+    section = shapes.rectangle(2.0, 2.0, 0.5, 2) if square else shapes.ellipse(1.0, 1.0, 16)
     taper = (leg * draw(0.75, 0.55, 1.0), leg)
     x, y = deep / 2 - leg - 0.4, wide / 2 - leg - 0.4
     patches: list[Patch] = []
     for sx, sy in product((-1.0, 1.0), repeat=2):
         foot = (sx * (x + splay), sy * (y + splay), 0.0)
         patches += _post("up", foot, (sx * x, sy * y, seat - thick + 0.5), section, taper)
-    patches += box("seat", (0.0, 0.0, seat - thick / 2), (deep, wide, thick), 0.45 * thick, steps=3, cells=2)
+    patches += shapes.box("seat", (0.0, 0.0, seat - thick / 2), (deep, wide, thick), 0.45 * thick, steps=3, cells=2)
     if draw.chance(0.35):
-        patches += box("cushion", (0.5, 0.0, seat + 1.4), (deep - 4.0, wide - 4.0, 4.4), 2.1, steps=3, cells=2)
+        patches += shapes.box("cushion", (0.5, 0.0, seat + 1.4), (deep - 4.0, wide - 4.0, 4.4), 2.1, steps=3, cells=2)
     if draw.chance(0.55, True):
         low = seat * draw(0.36, 0.25, 0.6)
         ahead, aside = (one + splay * (1.0 - low / seat) for one in (x, y))
@@ -77,7 +64,7 @@ def chair(draw: Draw) -> Instance:
             patches += _post("along", (-ahead, sy * aside, low), (ahead, sy * aside, low), section, thin)
         patches += _post("cross", (0.0, -aside, low), (0.0, aside, low), section, thinner)
     patches += _chair_back(draw, x, y, seat, total, lean, leg, section)
-    turned = placed(patches, rotation("z", draw(8.0, -25.0, 25.0)))
+    turned = shapes.placed(patches, shapes.rotation("z", draw(8.0, -25.0, 25.0)))
 
     offset = draw.offset()
     timber = draw.colour("a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0)
@@ -113,11 +100,11 @@ def _chair_back(
 
     for sy in (-1.0, 1.0):
         patches += _post("up", (at(foot), sy * y, foot), (at(total), sy * y, total), section, (leg, 0.85 * leg))
-    tilt = rotation("y", -float(np.degrees(np.arctan2(lean, total - seat))))
+    tilt = shapes.rotation("y", -float(np.degrees(np.arctan2(lean, total - seat))))
     depth = draw(1.6, 1.2, 2.4)
 
     def slat(tag: str, z: float, width: float, height: float, shift: float = 0.0) -> list[Patch]:
-        return placed(box(tag, (0.0, 0.0, 0.0), (depth, width, height), 0.5), tilt, (at(z), shift, z))
+        return shapes.placed(shapes.box(tag, (0.0, 0.0, 0.0), (depth, width, height), 0.5), tilt, (at(z), shift, z))
 
     inner = 2 * (y - 0.3 * leg)
     high = total - seat
@@ -146,12 +133,13 @@ def _shade(draw: Draw, low: float, high: float, wide: float, narrow: float) -> l
     """An open lampshade with a thin wall, standing free from `low` to `high`."""
     wall = 0.25
     belly = draw(0.0, -0.1, 0.12) * wide
-    outer = spline([(wide, low), ((wide + narrow) / 2 + belly, (low + high) / 2), (narrow, high)], 14)
+    outer = shapes.spline([(wide, low), ((wide + narrow) / 2 + belly, (low + high) / 2), (narrow, high)], 14)
     inner = (outer - np.array([wall, 0.0]))[::-1]
     pieces = [
-        ("shade", dense(outer, 2.0)), ("rim", [outer[-1], inner[0]]), ("lining", inner), ("rim", [inner[-1], outer[0]]),
+        ("shade", shapes.dense(outer, 2.0)), ("rim", [outer[-1], inner[0]]), ("lining", inner),
+        ("rim", [inner[-1], outer[0]]),
     ]  # fmt: skip
-    return lathe(pieces, 56)
+    return shapes.lathe(pieces, 56)
 
 
 def _lamp_base(draw: Draw, style: str, low: float, radius: float, stem: float) -> list[Patch]:
@@ -162,8 +150,8 @@ def _lamp_base(draw: Draw, style: str, low: float, radius: float, stem: float) -
         corners = [
             under[-1], (radius, 0.4), (radius * 0.96, thick), (stem * 2.0, thick * 1.4), (stem, thick * 2.2), top[0],
         ]  # fmt: skip
-        side = dense(rounded(corners, [0.3, 0.5, 1.0, 1.2], 5), 1.6)
-        return lathe([("base", under), ("base", side), ("base", top)], 44)
+        side = shapes.dense(shapes.rounded(corners, [0.3, 0.5, 1.0, 1.2], 5), 1.6)
+        return shapes.lathe([("base", under), ("base", side), ("base", top)], 44)
     belly = radius * draw(1.12, 0.95, 1.4)
     at = draw(0.38, 0.28, 0.6) * low
     waist = [(0.45 * belly, 0.72 * low)]
@@ -172,10 +160,10 @@ def _lamp_base(draw: Draw, style: str, low: float, radius: float, stem: float) -
     knots = [
         (radius * 0.96, 1.2), (radius * 0.8, 2.4), (belly, at), *waist, (stem * 1.5, 0.86 * low), (stem, 0.93 * low),
     ]  # fmt: skip
-    body = spline(knots, 34)
-    ring = rounded([under[-1], (radius, 0.2), (radius, 1.2), knots[0]], [0.15, 0.3], 3)
+    body = shapes.spline(knots, 34)
+    ring = shapes.rounded([under[-1], (radius, 0.2), (radius, 1.2), knots[0]], [0.15, 0.3], 3)
     neck = [knots[-1], top[0]]
-    return lathe([("base", under), ("foot", ring), ("body", body), ("base", neck), ("base", top)], 44)
+    return shapes.lathe([("base", under), ("foot", ring), ("body", body), ("base", neck), ("base", top)], 44)
 
 
 @family(metres=0.01)
@@ -187,13 +175,13 @@ def lamp(draw: Draw) -> Instance:
     style = draw.pick("body", "disc", "gourd")
     base = _lamp_base(draw, style, low + 0.25 * tall, radius, stem)
     patches = base + _shade(draw, low, total, wide, narrow)
-    patches += sphere("bulb", min(3.0, 0.4 * narrow), (0.0, 0.0, low + 0.42 * tall), 12, 20)
+    patches += shapes.sphere("bulb", min(3.0, 0.4 * narrow), (0.0, 0.0, low + 0.42 * tall), 12, 20)
     ring_z, inside = total - 0.12 * tall, narrow + (wide - narrow) * 0.12
     for angle in (20.0, 140.0, 260.0):
-        spoke = sweep("base", [(0.0, 0.0, ring_z), (inside, 0.0, ring_z)], ellipse(0.22, 0.22, 8))
-        patches += placed(spoke, rotation("z", angle))
+        spoke = shapes.sweep("base", [(0.0, 0.0, ring_z), (inside, 0.0, ring_z)], shapes.ellipse(0.22, 0.22, 8))
+        patches += shapes.placed(spoke, shapes.rotation("z", angle))
     rod = [(0, 0, z) for z in (low + 0.2 * tall, ring_z, ring_z + 0.8, ring_z + 1.0)]
-    patches += sweep("base", rod, ellipse(0.35, 0.35, 10), (1.0, 1.0, 1.6, 0.0), first=(1.0, 0.0, 0.0))
+    patches += shapes.sweep("base", rod, shapes.ellipse(0.35, 0.35, 10), (1.0, 1.0, 1.6, 0.0), first=(1.0, 0.0, 0.0))
     offset = draw.offset()
     linen = draw.colour("f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25)
     weave = clouded(linen, 0.93, 1.2, offset)

@@ -4,34 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+import advsearch.bundled.objects.shapes as shapes
 from advsearch.bundled.objects.draw import Draw
 from advsearch.bundled.objects.family import Instance, family, finish
-from advsearch.bundled.objects.shapes import (
-    Array,
-    Patch,
-    Points,
-    at_height,
-    ellipse,
-    frames,
-    lathe,
-    placed,
-    rectangle,
-    rotation,
-    sphere,
-    spline,
-    sweep,
-    upright,
-    vessel,
-)
+from advsearch.bundled.objects.shapes import Array, Patch, Points
 from advsearch.bundled.objects.textures import (
-    Paint,
     Texels,
     between,
     clouded,
     dots,
     natural,
     over,
-    painter,
     rings,
     shade,
     solid,
@@ -50,17 +33,19 @@ def _spout(draw: Draw, radius: float, height: float) -> list[Patch]:
     bend = 0.22 if style == "curved" else 0.04
     middle = (start + tip) / 2 + np.array([bend, 0.0, -0.6 * bend]) * radius * 0.5
     above = start + (tip - start) * 0.8 + np.array([-bend * 0.1, 0.0, -0.1 * bend]) * radius
-    path = spline([start, middle, above, tip], 18)
+    path = shapes.spline([start, middle, above, tip], 18)
     root, end = draw(1.75, 1.3, 2.2), draw(0.72, 0.55, 0.95)
     scale = end + (root - end) * (1.0 - np.linspace(0.0, 1.0, 18)) ** 1.3
-    tangent, first, second = frames(path, (0.0, 1.0, 0.0))
+    tangent, first, second = shapes.frames(path, (0.0, 1.0, 0.0))
     order = np.array([*range(18), 17, 17, 17, 16, 15, 14, 13])
     inner = scale[[17, 16, 15, 14, 13]] - 0.24
     radii = np.concatenate([scale, [end - 0.06, end - 0.12, inner[0], inner[1], inner[2], inner[3], 0.0]])
     push = np.zeros(len(order))
     push[18:21] = (0.1, 0.12, 0.06)
     frame = (tangent[order], first[order], second[order])
-    return sweep("spout", path[order] + push[:, None] * tangent[order], ellipse(1.0, 1.0, 20), radii, frame=frame)
+    return shapes.sweep(
+        "spout", path[order] + push[:, None] * tangent[order], shapes.ellipse(1.0, 1.0, 20), radii, frame=frame
+    )
 
 
 @family(metres=0.01)
@@ -72,15 +57,17 @@ def teapot(draw: Draw) -> Instance:
         (foot, 0.5), (radius * full, 0.5 * at * height), (radius, at * height),
         (radius * (0.97 * full), (0.42 * at + 0.58) * height), (mouth, height),
     ]  # fmt: skip
-    side = spline(knots, 26)
+    side = shapes.spline(knots, 26)
     dome, r = draw(1.5, 0.7, 2.4), draw(1.0, 0.7, 1.4)
     top = height + dome + 0.2
     rim = [
         (mouth, height), (mouth * 0.97, height + 0.02), (mouth * 0.94, height - 0.12), (mouth * 0.94, height + 0.05),
         (mouth * 0.97, height + 0.05),
     ]  # fmt: skip
-    lid = spline([rim[-1], (mouth * 0.9, height + 0.35), (mouth * 0.55, height + 0.75 * dome + 0.2), (0.35, top)], 10)
-    knob = spline(
+    lid = shapes.spline(
+        [rim[-1], (mouth * 0.9, height + 0.35), (mouth * 0.55, height + 0.75 * dome + 0.2), (0.35, top)], 10
+    )
+    knob = shapes.spline(
         [(0.45, top), (0.5, top + 0.3), (r, top + 0.45 + r * 0.6), (0.7 * r, top + 0.45 + 1.35 * r),
          (0.0, top + 0.45 + 1.6 * r)], 12,
     )  # fmt: skip
@@ -91,10 +78,10 @@ def teapot(draw: Draw) -> Instance:
         ("lid", lid),
         ("knob", [lid[-1], *knob]),
     ]
-    body = lathe(profile, 56)
+    body = shapes.lathe(profile, 56)
     span = draw(0.9, 0.75, 1.0)
     high, low = height * 0.84, height * (0.84 - 0.62 * span)
-    top_root, low_root = (at_height(side, z) - 0.25 for z in (high, low))
+    top_root, low_root = (shapes.at_height(side, z) - 0.25 for z in (high, low))
     reach = radius * draw(0.72, 0.5, 0.9)
     lift = draw(0.05, -0.02, 0.2) * height
     knots = [
@@ -102,9 +89,14 @@ def teapot(draw: Draw) -> Instance:
         (radius + draw(0.95, 0.7, 1.0) * reach, 0.5 * (high + low)), (radius + 0.4 * reach, low + 0.08 * (high - low)),
         (low_root, low),
     ]  # fmt: skip
-    section = ellipse(draw(0.5, 0.4, 0.7), draw(0.62, 0.45, 0.85), 16)
-    grip = sweep("handle", upright(spline(knots, 26)), section, 1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3)
-    patches = placed([*body, *_spout(draw, radius, height), *placed(grip, rotation("z", 180.0))], rotation("z", 118.0))
+    section = shapes.ellipse(draw(0.5, 0.4, 0.7), draw(0.62, 0.45, 0.85), 16)
+    grip = shapes.sweep(
+        "handle", shapes.upright(shapes.spline(knots, 26)), section, 1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3
+    )
+    patches = shapes.placed(
+        [*body, *_spout(draw, radius, height), *shapes.placed(grip, shapes.rotation("z", 180.0))],
+        shapes.rotation("z", 118.0),
+    )
 
     offset = draw.offset()
     clay = draw.colour("7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0")
@@ -141,38 +133,48 @@ def teapot(draw: Draw) -> Instance:
 def frying_pan(draw: Draw) -> Instance:
     base, rim = draw(10.5, 9.0, 11.5), draw(13.0, 12.2, 14.5)
     depth, wall = draw(4.2, 2.8, 5.5), draw(0.38, 0.3, 0.55)
-    side = spline([(base - 0.8, 0.0), (base, 0.25), (base + 0.55 * (rim - base), 0.5 * depth), (rim, depth)], 14)
-    body = vessel(side, wall, 0.5, columns=64, step=1.6)
+    side = shapes.spline([(base - 0.8, 0.0), (base, 0.25), (base + 0.55 * (rim - base), 0.5 * depth), (rim, depth)], 14)
+    body = shapes.vessel(side, wall, 0.5, columns=64, step=1.6)
 
     length = draw(18.0, 14.0, 21.0)
     root = np.array([rim - 0.6, 0.0, 0.78 * depth])
     rise = draw(2.6, 0.6, 4.5)
     along = [(0.0, 0.0), (0.22 * length, 0.55 * rise), (0.6 * length, rise), (length, rise * draw(1.05, 0.8, 1.2))]
-    path = spline(root + upright(np.array(along)), 26)
+    path = shapes.spline(root + shapes.upright(np.array(along)), 26)
     t = np.linspace(0.0, 1.0, 26)
     width, thick = draw(1.15, 0.85, 1.5), draw(0.62, 0.45, 0.9)
     shape = (0.62 + 0.38 * np.clip(t / 0.35, 0.0, 1.0) ** 1.5) * (1.0 + draw(0.12, 0.0, 0.25) * np.sin(np.pi * t))
     end = np.sqrt(np.clip(1.0 - ((t - 0.94) / 0.06).clip(0.0, 1.0) ** 2, 0.0, 1.0))
     scale = np.stack([thick * (0.7 + 0.3 * np.clip(t / 0.3, 0.0, 1.0)), width * shape], axis=1) * end[:, None]
-    section = ellipse(1.0, 1.0, 20) if draw.chance(0.5, True) else rectangle(2.0, 2.0, 0.7)
-    grip = sweep("handle", path, section, scale)
-    inner = at_height(side, 0.72 * depth) - wall
+    section = shapes.ellipse(1.0, 1.0, 20) if draw.chance(0.5, True) else shapes.rectangle(2.0, 2.0, 0.7)
+    grip = shapes.sweep("handle", path, section, scale)
+    inner = shapes.at_height(side, 0.72 * depth) - wall
     rivets = [
         patch
         for y in (-1.1, 1.1)
-        for patch in sphere("rivet", 0.38, (inner + 0.02, y, 0.72 * depth), rows=8, columns=12)
+        for patch in shapes.sphere("rivet", 0.38, (inner + 0.02, y, 0.72 * depth), rows=8, columns=12)
     ]
     spine = [(rim - 1.4, 0.72 * depth), (rim - 0.3, 0.75 * depth), (rim + 0.2 * length, 0.78 * depth + 0.5 * rise)]
-    bracket = sweep("bracket", upright(np.array(spine)), rectangle(0.7, 3.0, 0.25), (1.0, 1.0, 0.62), caps=True)
-    patches = placed([*body, *grip, *rivets, *bracket], rotation("z", 118.0))
+    bracket = shapes.sweep(
+        "bracket", shapes.upright(np.array(spine)), shapes.rectangle(0.7, 3.0, 0.25), (1.0, 1.0, 0.62), caps=True
+    )
+    patches = shapes.placed([*body, *grip, *rivets, *bracket], shapes.rotation("z", 118.0))
 
     offset = draw.offset()
     coat = draw.colour("2b2c2e", "3a3a3c", "1c1d1f", "8c8f94", "5c4033", wild=0.2)
+
+    def turned(t: Texels) -> Array:
+        """Faint rings, as turning leaves."""
+        return step(np.sin(2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9), 0.6, 0.8) * 0.35
+
     inside = speckled(clouded(coat, 1.2, 5.0, offset), shade(coat, 1.7), 0.5, offset, 0.06)
     if draw.chance(0.4, True):
-        inside = over(inside, _turned(), solid(shade(coat, 1.6)))
+        inside = over(inside, turned, solid(shade(coat, 1.6)))
     outer = draw.colour("a9231f", "2b2c2e", "9a9da1", "2f5d7c", "3d6b4a", "d9822b")
-    outside = natural(draw, 2 * rim, _enamel(outer, depth, offset), 0.3)
+    enamel = clouded(outer, 0.85, 5.0, offset)  # darker towards the bottom, with a dark line at the rim
+    enamel = over(enamel, between(-1.0, 0.25 * depth, soft=0.6 * depth), solid(shade(outer, 0.6)))
+    enamel = over(enamel, between(depth - 0.1, 2 * depth, soft=0.15), solid("2b2c2e"))
+    outside = natural(draw, 2 * rim, enamel, 0.3)
     inside = natural(draw, 2 * rim, inside, 0.2)
     style = draw.pick("black", "wood", "wild")
     holds = {
@@ -184,16 +186,3 @@ def frying_pan(draw: Draw) -> Instance:
     paints = {"outside": outside, "inside": inside, "handle": holds[style], "rivet": steel, "bracket": steel}
     paints["base"] = solid(draw.colour("77797c", "2b2c2e"))
     return Instance(patches, paints, finish(draw, 0.38, 0.3), {"base": 0.5})
-
-
-@painter
-def _turned(t: Texels) -> Array:
-    """Faint rings, as turning leaves."""
-    return step(np.sin(2 * np.pi * np.hypot(t.xyz[:, 0], t.xyz[:, 1]) / 0.9), 0.6, 0.8) * 0.35
-
-
-def _enamel(color: Array, height: float, offset: Array) -> Paint:
-    """Enamel that darkens towards the bottom, with a dark line at the rim."""
-    paint = clouded(color, 0.85, 5.0, offset)
-    paint = over(paint, between(-1.0, 0.25 * height, soft=0.6 * height), solid(shade(color, 0.6)))
-    return over(paint, between(height - 0.1, 2 * height, soft=0.15), solid("2b2c2e"))

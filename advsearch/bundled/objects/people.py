@@ -9,7 +9,7 @@ from advsearch.bundled.objects.draw import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family
 from advsearch.bundled.objects.shapes import Array, Patch, Rest
 from advsearch.bundled.objects.textures import Texels, mix, noise, painter, step
-from advsearch.scene.assets import Ints, Material, face_vectors
+from advsearch.scene.assets import Material, face_vectors
 from advsearch.scene.people import Person, body_data
 
 FINISHES = {
@@ -44,7 +44,10 @@ def _patches(person: Person) -> list[Patch]:
     ends = np.cumsum([0, *data["triangles"]])
     faces = data["faces"].astype(np.int64)
     whole = np.concatenate([faces[a:b] + start for a, b, start in zip(ends, ends[1:], starts, strict=False)])
-    normals = _normals(vertices, whole, index)
+    summed = np.zeros((int(index.max()) + 1, 3))  # smooth across the seams of charts
+    np.add.at(summed, index[whole].reshape(-1), np.repeat(face_vectors(vertices[whole]), 3, axis=0))
+    normals = summed[index]
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     patches = []
     for number, tag in enumerate(data["tags"]):
         mine, own = slice(starts[number], starts[number + 1]), faces[ends[number] : ends[number + 1]]
@@ -52,14 +55,6 @@ def _patches(person: Person) -> list[Patch]:
         rest = _rest(charts[mine], reference[mine])
         patches.append(Patch(str(tag), vertices[mine], normals[mine], charts[mine], own, (width, height), rest))
     return patches
-
-
-def _normals(vertices: Array, faces: Ints, index: Ints) -> Array:
-    """Unit normals (V, 3), smooth across the seams of charts."""
-    summed = np.zeros((int(index.max()) + 1, 3))
-    np.add.at(summed, index[faces].reshape(-1), np.repeat(face_vectors(vertices[faces]), 3, axis=0))
-    normals = summed[index]
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
 
 
 @painter

@@ -15,6 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import CubicHermiteSpline, RegularGridInterpolator
 
 from advsearch.scene.assets import face_vectors
 
@@ -60,8 +61,7 @@ def rotation(axis: str, degrees: float) -> Array:
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     turn = np.eye(3)
-    turn[i, i] = turn[j, j] = c
-    turn[i, j], turn[j, i] = -s, s
+    turn[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
     return turn
 
 
@@ -69,15 +69,7 @@ def spline(points: Points, count: int) -> Array:
     """Return `count` points of the Catmull-Rom curve (chord-length knots) through (K, D) points, ends included."""
     knots = np.asarray(points, dtype=np.float64)
     at = lengths(knots)
-    slope = np.gradient(knots, at, axis=0)
-    t = np.linspace(0.0, at[-1], count)
-    i = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(knots) - 2)
-    span = (at[i + 1] - at[i])[:, None]
-    x = (t - at[i])[:, None] / span
-    start, end = knots[i], knots[i + 1]
-    first, last = slope[i] * span, slope[i + 1] * span
-    turn = 2 * start - 2 * end + first + last
-    curve: Array = ((turn * x + (3 * end - 3 * start - 2 * first - last)) * x + first) * x + start
+    curve: Array = CubicHermiteSpline(at, knots, np.gradient(knots, at, axis=0))(np.linspace(0.0, at[-1], count))
     return curve
 
 
@@ -184,17 +176,6 @@ def stretched(patches: Iterable[Patch], factors: Sequence[float] | Array) -> lis
 # ------------------------------------------------------------------------------------------------ grid patches
 
 
-def _grid_faces(points: Array) -> Indices:
-    """Two triangles for every cell of a grid (R, C, 3), but for those whose area is nothing beside the others', as
-    where a row shrinks to a point."""
-    rows, columns = points.shape[:2]
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
-    beside = corner[:, None] + [[0, 1, columns + 1, 0, columns + 1, columns]]
-    faces = beside.reshape(-1, 3).astype(np.int64)
-    area = np.linalg.norm(face_vectors(points.reshape(-1, 3)[faces]), axis=1)
-    return np.asarray(faces[area > 1e-6 * float(np.median(area[area > 0.0]))])
-
-
 def grid(tag: str, points: Array, normals: Array, size: tuple[float, float], down: Array, across: Array) -> Patch:
     """Return the patch over a grid of points: u runs along columns, v along rows, du x dv points outwards.
 
@@ -208,17 +189,17 @@ def grid(tag: str, points: Array, normals: Array, size: tuple[float, float], dow
     rows, columns = points.shape[:2]
     u, v = np.broadcast_to(across, (rows, columns)), np.broadcast_to(down[:, None], (rows, columns))
 
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
+    faces = (corner[:, None] + [[0, 1, columns + 1, 0, columns + 1, columns]]).reshape(-1, 3).astype(np.int64)
+    area = np.linalg.norm(face_vectors(points.reshape(-1, 3)[faces]), axis=1)
+    faces = faces[area > 1e-6 * float(np.median(area[area > 0.0]))]  # none where a row shrinks to a point
+    places = RegularGridInterpolator((down, across), points, bounds_error=False, fill_value=None)
+
     def rest(at_u: Array, at_v: Array) -> Array:
-        i = np.clip(np.searchsorted(down, at_v, side="right") - 1, 0, rows - 2)
-        j = np.clip(np.searchsorted(across, at_u, side="right") - 1, 0, columns - 2)
-        s = ((at_v - down[i]) / (down[i + 1] - down[i]))[:, None]
-        t = ((at_u - across[j]) / (across[j + 1] - across[j]))[:, None]
-        low = points[i, j] * (1 - t) + points[i, j + 1] * t
-        high = points[i + 1, j] * (1 - t) + points[i + 1, j + 1] * t
-        return low * (1 - s) + high * s
+        return np.asarray(places(np.stack([at_v, at_u], axis=-1)))
 
     uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
-    return Patch(tag, points.reshape(-1, 3), normals.reshape(-1, 3), uvs, _grid_faces(points), size, rest)
+    return Patch(tag, points.reshape(-1, 3), normals.reshape(-1, 3), uvs, faces, size, rest)
 
 
 def _along(curve: Array) -> tuple[Array, float]:
@@ -322,17 +303,6 @@ def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patc
     return patches
 
 
-def _unlooped(curve: Array, offset: Array) -> Array:
-    """Drop the points at which an offset curve runs backwards, as it does in tight bends; the last one stays."""
-    keep = np.arange(len(curve))
-    while len(keep) > 2:
-        back = (np.diff(offset[keep], axis=0) * np.diff(curve[keep], axis=0)).sum(axis=1) <= 0.0
-        if not back.any():
-            break
-        keep = np.append(keep[:-1][~back], keep[-1])
-    return offset[keep]
-
-
 def vessel(outside: Array, wall: float, floor: float, *, columns: int = 56, step: float = 0.7) -> list[Patch]:
     """An open container: an "outside" profile with a rounded lip, an "inside" at constant wall thickness with a floor,
     and a "base".
@@ -345,7 +315,13 @@ def vessel(outside: Array, wall: float, floor: float, *, columns: int = 56, step
         step: longest edge along the profile.
     """
     normal = _profile_normals([outside])[0]
-    inner = _unlooped(outside, outside - wall * normal)[::-1]
+    inner, keep = outside - wall * normal, np.arange(len(outside))
+    while len(keep) > 2:  # points at which it runs backwards, as in tight bends, go; the last one stays
+        back = (np.diff(inner[keep], axis=0) * np.diff(outside[keep], axis=0)).sum(axis=1) <= 0.0
+        if not back.any():
+            break
+        keep = np.append(keep[:-1][~back], keep[-1])
+    inner = inner[keep][::-1]
     half = np.pi * np.arange(1, 6) / 6
     top, across = outside[-1] - wall / 2 * normal[-1], wall / 2 * normal[-1]
     up = np.array([-across[1], across[0]])
@@ -398,19 +374,6 @@ def frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
     return tangent, normal, np.cross(tangent, normal)
 
 
-def _sweep_normals(points: Array, tangent: Array) -> Array:
-    """Normals of a (R, M, 3) grid closed around, from central differences; where a row is a point, the tangent."""
-    around = np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1)
-    along = np.gradient(points, axis=0)
-    normal = np.cross(around, along)
-    size = np.linalg.norm(normal, axis=-1)
-    weak = size < 1e-7 * float(size.max())
-    result = unit(normal)
-    for row, side in ((0, -1.0), (-1, 1.0)):
-        result[row][weak[row]] = side * tangent[row]
-    return result
-
-
 def sweep(
     tag: str,
     path: Points,
@@ -437,7 +400,11 @@ def sweep(
     scales = np.broadcast_to(scales.reshape(-1, 1) if scales.ndim < 2 else scales, (len(centres), 2))
     flat = section[None] * scales[:, None]
     points = centres[:, None] + flat[..., :1] * a[:, None] + flat[..., 1:] * b[:, None]
-    normals = _sweep_normals(points, tangent)
+    normals = np.cross(np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1), np.gradient(points, axis=0))
+    long = np.linalg.norm(normals, axis=-1)
+    normals = unit(normals)
+    for row, side in ((0, -1.0), (-1, 1.0)):  # where a row is a point
+        normals[row][long[row] < 1e-7 * float(long.max())] = side * tangent[row]
     ring, around = _along(np.concatenate([section, section[:1]]))
     closed = np.concatenate([points, points[:, :1]], axis=1)
     closed_normals = np.concatenate([normals, normals[:, :1]], axis=1)
@@ -493,7 +460,9 @@ def box(
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
         for side in (1.0, -1.0):
-            u, v = (_box_line(half[k], bevel, steps, cells) for k in (i, j))
+            edges = [core[k] + bevel * np.tan(np.linspace(0.0, np.pi / 4, steps + 1)) for k in (i, j)]  # equal angles
+            flats = [np.linspace(-core[k], core[k], cells + 1) for k in (i, j)]
+            u, v = (np.concatenate([-edge[:0:-1], flat, edge[1:]]) for edge, flat in zip(edges, flats, strict=True))
             cube = np.empty((len(v), len(u), 3))
             cube[..., axis] = half[axis]
             cube[..., i], cube[..., j] = u[None], v[:, None]
@@ -510,14 +479,6 @@ def box(
             extent = (2 * float(half[i]), 2 * float(half[j]))
             patches.append(grid(tag, points + np.asarray(centre, dtype=np.float64), normal, extent, down, across))
     return patches
-
-
-def _box_line(half: float, bevel: float, steps: int, cells: int) -> Array:
-    """Grid lines across a box's face: equal angles over each rounded edge, equal cells between."""
-    angle = np.tan(np.linspace(0.0, np.pi / 4, steps + 1))
-    edge = half - bevel + bevel * angle
-    flat = np.linspace(-(half - bevel), half - bevel, cells + 1)
-    return np.concatenate([-edge[::-1][:-1], flat, edge[1:]])
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -542,16 +503,21 @@ def carved(patches: Iterable[Patch], inside: Field, tag: str | None) -> list[Pat
         inside: where to carve.
         tag: what is carved out becomes this; None leaves it out.
     """
-    found = []
+    pieces = []
     for patch in patches:
-        value = _snapped(patch, inside(patch.vertices))
+        edges, value = _edges(patch), np.array(inside(patch.vertices))
+        ends = value[edges]
+        crossed = ends[:, 0] * ends[:, 1] < 0.0
+        share = np.abs(ends[crossed]) / np.abs(ends[crossed]).sum(axis=1, keepdims=True)
+        value[edges[crossed][share < SNAP]] = 0.0
         if value.max() <= 0.0:
-            found.append(patch)
+            pieces.append(patch)
             continue
         cut, side = _split(patch, value)
-        found += [cropped(replace(cut, faces=cut.faces[~side]))] if not side.all() else []
-        found += [cropped(replace(cut, faces=cut.faces[side], tag=tag))] if tag is not None and side.any() else []
-    return found
+        for faces, part in ((cut.faces[~side], patch.tag), (cut.faces[side], tag)):
+            if len(faces) and part is not None:
+                pieces.append(cropped(replace(cut, faces=faces, tag=part)))
+    return pieces
 
 
 def cropped(patch: Patch) -> Patch:
@@ -568,17 +534,6 @@ def _edges(patch: Patch) -> Indices:
     pairs = np.concatenate([patch.faces[:, [0, 1]], patch.faces[:, [1, 2]], patch.faces[:, [2, 0]]])
     edges: Indices = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
     return edges
-
-
-def _snapped(patch: Patch, value: Array) -> Array:
-    """The values with 0 at vertices that the curve passes closely."""
-    edges = _edges(patch)
-    ends = value[edges]
-    crossed = ends[:, 0] * ends[:, 1] < 0.0
-    share = np.abs(ends[crossed]) / np.abs(ends[crossed]).sum(axis=1, keepdims=True)
-    value = value.copy()
-    value[edges[crossed][share < SNAP]] = 0.0
-    return value
 
 
 def _split(patch: Patch, value: Array) -> tuple[Patch, Bools]:

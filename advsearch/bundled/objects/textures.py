@@ -166,16 +166,15 @@ def checks(t: Texels, a: Color, b: Color, cell: float) -> Array:
     return mix(a, b, (np.floor(2 * across) + np.floor(2 * up)) % 2.0)
 
 
-@painter
-def _staggered(t: Texels, cell: float, radius: float) -> Array:
-    across, up = _cells(t, cell)
-    across = across + 0.5 * (np.floor(up) % 2.0)
-    return step(radius - np.hypot(across % 1.0 - 0.5, up % 1.0 - 0.5), 0.0, 0.1)
-
-
 def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
     """Round dots in staggered rows on another paint; radius in cells."""
-    return over(base, _staggered(cell, radius), solid(color))
+
+    def staggered(t: Texels) -> Array:
+        across, up = _cells(t, cell)
+        across = across + 0.5 * (np.floor(up) % 2.0)
+        return step(radius - np.hypot(across % 1.0 - 0.5, up % 1.0 - 0.5), 0.0, 0.1)
+
+    return over(base, staggered, solid(color))
 
 
 @painter

@@ -8,24 +8,10 @@ from itertools import combinations
 
 import numpy as np
 
+import advsearch.bundled.objects.shapes as shapes
 from advsearch.bundled.objects.draw import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family, finish
-from advsearch.bundled.objects.shapes import (
-    Array,
-    Patch,
-    away_from,
-    box,
-    cap,
-    grid,
-    lathe,
-    placed,
-    polygon,
-    rotation,
-    rounded,
-    sphere,
-    sweep,
-    unit,
-)
+from advsearch.bundled.objects.shapes import Array, Patch
 from advsearch.bundled.objects.textures import (
     Paint,
     Texels,
@@ -46,11 +32,11 @@ from advsearch.scene.assets import Material
 
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
 _SIGNS = ((a, b) for a in (-1.0, 1.0) for b in (-_GOLDEN, _GOLDEN))
-PENTAGONS = unit(np.array([corner for a, b in _SIGNS for corner in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))]))
+PENTAGONS = shapes.unit(np.array([corner for a, b in _SIGNS for corner in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))]))
 """The 12 unit directions of an icosahedron's corners: the middles of a football's dark panels."""
 _NEAR = PENTAGONS @ PENTAGONS.T > 0.4
 _FACES = [face for face in combinations(range(12), 3) if all(_NEAR[pair] for pair in combinations(face, 2))]
-HEXAGONS = unit(np.array([PENTAGONS[list(face)].sum(axis=0) for face in _FACES]))
+HEXAGONS = shapes.unit(np.array([PENTAGONS[list(face)].sum(axis=0) for face in _FACES]))
 """The 20 unit directions of its face middles: the middles of the light panels."""
 
 
@@ -81,7 +67,7 @@ def _grooved(patches: list[Patch], radius: float, depth: float, seam: Callable[[
 
 @painter
 def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
-    away, pentagon = football_seams(unit(t.xyz))
+    away, pentagon = football_seams(shapes.unit(t.xyz))
     base = mix(light, dark, pentagon.astype(np.float64)) * (1.0 - 0.06 * noise(t.xyz / 2.0 + offset))[:, None]
     return mix(hexed("3a3a3a"), base, step(away, 0.012, 0.016))
 
@@ -97,7 +83,7 @@ def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array
 @painter
 def _near_to(t: Texels, seam: Callable[[Array], Array], reach: float) -> Array:
     """1 within so far of a seam."""
-    return step(-seam(unit(t.xyz)), -reach, 0.02)
+    return step(-seam(shapes.unit(t.xyz)), -reach, 0.02)
 
 
 @painter
@@ -111,8 +97,8 @@ def ball(draw: Draw) -> Instance:
     radius = 11.0
     style = draw.pick("football", "beach", "basket", "tennis", "star", "plain", "wild", "wild")
     squash = draw(1.0, 0.95, 1.03)
-    patches = sphere("ball", radius, rows=28, columns=48)
-    turn = rotation("z", draw(12.0, 0.0, 360.0)) @ rotation("x", draw(24.0, 0.0, 180.0))
+    patches = shapes.sphere("ball", radius, rows=28, columns=48)
+    turn = shapes.rotation("z", draw(12.0, 0.0, 360.0)) @ shapes.rotation("x", draw(24.0, 0.0, 180.0))
     offset = draw.offset()
     light = draw.colour("f1f0ea", "f4f4f2", "e8d34a", wild=0.3)
     dark = draw.colour("1d1f22", "23395d", "b5442e", wild=0.3)
@@ -134,19 +120,15 @@ def ball(draw: Draw) -> Instance:
         paint = anything(draw, 2 * radius)
     else:
         paint = _football(light, dark, offset)
-        patches = _grooved(patches, radius, 0.008, lambda d: football_seams(unit(d))[0] * 1.5)
-    shaped = [replace(p, vertices=p.vertices * np.array([1.0, 1.0, squash])) for p in placed(patches, turn)]
+        patches = _grooved(patches, radius, 0.008, lambda d: football_seams(shapes.unit(d))[0] * 1.5)
+    shaped = [replace(p, vertices=p.vertices * np.array([1.0, 1.0, squash])) for p in shapes.placed(patches, turn)]
     return Instance(shaped, {"ball": paint}, finish(draw, 0.4, 0.3))
 
 
 @family(metres=0.01)
 def banana(draw: Draw) -> Instance:
-    length, bend, thick, stem = (
-        draw(19.0, 15.0, 22.0),
-        draw(105.0, 65.0, 130.0),
-        draw(1.65, 1.45, 2.1),
-        draw(2.4, 1.6, 3.6),
-    )
+    length, bend = draw(19.0, 15.0, 22.0), draw(105.0, 65.0, 130.0)
+    thick, stem = draw(1.65, 1.45, 2.1), draw(2.4, 1.6, 3.6)
     count = 44
     t = np.linspace(0.0, 1.0, count)
     angle = np.radians(bend * (t + 0.05 * np.sin(2 * np.pi * t)) - bend / 2)[:-1]
@@ -165,9 +147,9 @@ def banana(draw: Draw) -> Instance:
     phi = 2 * np.pi * np.arange(30) / 30
     lumps = 1.0 + ridge * (np.abs(np.cos(2.5 * phi)) - 0.6)
     section = np.stack([np.cos(phi), np.sin(phi)], axis=1) * lumps[:, None]
-    patches = sweep("banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True)
-    patches = placed(patches, rotation("y", draw(9.0, 0.0, 14.0)))
-    patches = placed(patches, rotation("z", draw(78.0, 45.0, 120.0)))
+    patches = shapes.sweep("banana", path, section, radius, first=(0.0, 0.0, 1.0), caps=True)
+    patches = shapes.placed(patches, shapes.rotation("y", draw(9.0, 0.0, 14.0)))
+    patches = shapes.placed(patches, shapes.rotation("z", draw(78.0, 45.0, 120.0)))
 
     offset = draw.offset()
     skin = draw.colour("f0c930", "f3d64a", "e3b62a", "b7c04a", wild=0.0)
@@ -201,16 +183,16 @@ def book(draw: Draw) -> Instance:
     bulge = draw(0.35, 0.0, 0.7)
     patches: list[Patch] = []
     for z in (board / 2, thick - board / 2):
-        patches += box("cover", (0.25, 0.0, z), (width, height, board), 0.12)
+        patches += shapes.box("cover", (0.25, 0.0, z), (width, height, board), 0.12)
     size = (width - lip - 0.5, height - 2 * lip, thick - 2 * board + 0.04)
-    patches += box("pages", (0.3 - lip / 2, 0.0, thick / 2), size, 0.05, steps=1)
+    patches += shapes.box("pages", (0.3 - lip / 2, 0.0, thick / 2), size, 0.05, steps=1)
     half = thick / 2
     angle = np.linspace(-np.pi / 2, np.pi / 2, 9)
     cosine, sine = np.cos(angle), np.sin(angle)
     outer = np.stack([-width / 2 + 0.25 - bulge * cosine - 0.1, half + half * sine], axis=1)
     inner = np.stack([-width / 2 + 0.25 - bulge * cosine + board, half + (half - board) * sine], axis=1)[::-1]
     patches += _spine(outer, inner, height)
-    turned = placed(patches, rotation("z", draw(-122.0, -150.0, -100.0)))
+    turned = shapes.placed(patches, shapes.rotation("z", draw(-122.0, -150.0, -100.0)))
 
     offset = draw.offset()
     cloth = draw.colour("7a1f2b", "1f3f5f", "2f5b46", "20242a", "c98a3a", "5b3a6b", "d8d0bd")
@@ -239,13 +221,15 @@ def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
     """Extrude the spine's section along y: its outer curve (K, 2) upwards in (x, z), its inner one downwards."""
     loop = np.concatenate([outer, inner])[::-1]
     frame = (np.tile([0.0, -1.0, 0.0], (2, 1)), np.tile([1.0, 0.0, 0.0], (2, 1)), np.tile([0.0, 0.0, 1.0], (2, 1)))
-    patches = sweep("spine", [(0.0, height / 2, 0.0), (0.0, -height / 2, 0.0)], loop, frame=frame)
+    patches = shapes.sweep("spine", [(0.0, height / 2, 0.0), (0.0, -height / 2, 0.0)], loop, frame=frame)
     size = (float(np.ptp(outer[:, 1])), float(np.ptp(outer[:, 0])) + float(np.linalg.norm(outer[0] - inner[-1])))
     for side in (1.0, -1.0):
         rows = [np.insert(curve, 1, side * height / 2, axis=1) for curve in (outer, inner[::-1])]
         ends = np.stack(rows if side > 0 else rows[::-1])
         normal = np.broadcast_to([0.0, side, 0.0], ends.shape)
-        patches.append(grid("spine", ends, normal, size, np.array([0.0, 1.0]), np.linspace(0.0, 1.0, len(outer))))
+        patches.append(
+            shapes.grid("spine", ends, normal, size, np.array([0.0, 1.0]), np.linspace(0.0, 1.0, len(outer)))
+        )
     return patches
 
 
@@ -306,17 +290,6 @@ FINISHES = {
 }
 
 
-def _away_from_word(x: Array, y: Array, word: str, height: float) -> Array:
-    """Distance to the strokes of a word centred at (0, 0), in the unit of x and y."""
-    lefts = [(k - len(word) / 2) * 0.74 * height + 0.07 * height for k in range(len(word))]
-    strokes = [
-        np.array(path) * height + np.array([left, -height / 2])
-        for left, letter in zip(lefts, word, strict=True)
-        for path in _STROKES[letter]
-    ]
-    return away_from(x, y, *strokes)
-
-
 @painter
 def _face(t: Texels, red: Array, radius: float) -> Array:
     """The word in white on red, with a white rim. Octagon of a circumradius, painted before it is raised."""
@@ -325,34 +298,34 @@ def _face(t: Texels, red: Array, radius: float) -> Array:
     y, z = t.xyz[:, 1], t.xyz[:, 2]
     out = np.max([y * np.cos(a) + z * np.sin(a) for a in turns], axis=0)
     rim = step(out - 0.915 * inner, 0.0, 0.006) * step(0.985 * inner - out, 0.0, 0.006)
-    letters = step(0.05 * inner - _away_from_word(y, z, "STOP", 0.52 * inner), 0.0, 0.006)
-    return mix(red, hexed("f3f2ee"), np.maximum(rim, letters))
-
-
-def _plate(radius: float, thick: float) -> list[Patch]:
-    """An octagon that looks along +x, its middle at the origin."""
-    ring = polygon(8, 0.02, 2) * radius
-    front = np.stack([np.full(len(ring), thick), ring[:, 0], ring[:, 1]], axis=1)
-    back = front * np.array([0.0, 1.0, 1.0])
-    edge = sweep("metal", [[0.0, 0, 0], [thick, 0, 0]], ring, first=(0.0, 1.0, 0.0))
-    along = np.array([1.0, 0.0, 0.0])
-    return [cap("face", front, along), *edge, cap("metal", back[::-1], -along)]
+    high, letters = 0.52 * inner, "STOP"
+    strokes = [
+        np.array(path) * high + np.array([((k - len(letters) / 2) * 0.74 + 0.07) * high, -high / 2])
+        for k, letter in enumerate(letters)
+        for path in _STROKES[letter]
+    ]
+    word = step(0.05 * inner - shapes.away_from(y, z, *strokes), 0.0, 0.006)
+    return mix(red, hexed("f3f2ee"), np.maximum(rim, word))
 
 
 @family(metres=1.0, texels=192)
 def stop_sign(draw: Draw) -> Instance:
     radius, height = draw(0.45, 0.4, 0.5), draw(0.74, 0.66, 0.84)
     red = draw.colour("b3121d", "a8161f", "c0202a", wild=0.0)
-    plate = placed(_plate(radius, 0.004), offset=(0.036, 0.0, height))
-    tube = rounded([(0.03, 0.0), (0.03, height + 0.7 * radius), (0.0, height + 0.7 * radius + 0.004)], 0.004, 2)
-    post = lathe([("post", [(0.0, 0.0), (0.03, 0.0)]), ("post", tube[:-1]), ("post", tube[-2:])], 20)
+    ring, ahead = shapes.polygon(8, 0.02, 2) * radius, np.array([1.0, 0.0, 0.0])
+    back = np.insert(ring, 0, 0.0, axis=1)  # an octagon that looks along +x, its middle at the origin
+    edge = shapes.sweep("metal", [(0.0, 0.0, 0.0), 0.004 * ahead], ring, first=(0.0, 1.0, 0.0))
+    plate = [shapes.cap("face", back + 0.004 * ahead, ahead), *edge, shapes.cap("metal", back[::-1], -ahead)]
+    plate = shapes.placed(plate, offset=(0.036, 0.0, height))
+    tube = shapes.rounded([(0.03, 0.0), (0.03, height + 0.7 * radius), (0.0, height + 0.7 * radius + 0.004)], 0.004, 2)
+    post = shapes.lathe([("post", [(0.0, 0.0), (0.03, 0.0)]), ("post", tube[:-1]), ("post", tube[-2:])], 20)
     foot = [
-        *box("rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), 0.02, 2),
-        *box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), 0.01, 1),
+        *shapes.box("rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), 0.02, 2),
+        *shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), 0.01, 1),
     ]
     heights = (height - 0.5 * radius, height + 0.5 * radius)
-    clamps = [patch for z in heights for patch in box("post", (0.008, 0.0, z), (0.05, 0.09, 0.03), 0.006, 1)]
+    clamps = [patch for z in heights for patch in shapes.box("post", (0.008, 0.0, z), (0.05, 0.09, 0.03), 0.006, 1)]
     grey = draw.colour("9a9da0", "7d8083", wild=0.0)
     paints = {"face": _face(red, radius), "metal": solid("a4a7aa"), "post": solid(grey), "rubber": solid("1d1d1f")}
-    turned = placed([*plate, *post, *foot, *clamps], rotation("z", draw(0.0, -25.0, 25.0)))
+    turned = shapes.placed([*plate, *post, *foot, *clamps], shapes.rotation("z", draw(0.0, -25.0, 25.0)))
     return Instance(turned, paints, FINISHES["face"], {"metal": 0.25, "post": 0.18, "rubber": 0.3}, FINISHES)

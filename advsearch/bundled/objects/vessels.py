@@ -4,24 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+import advsearch.bundled.objects.shapes as shapes
 from advsearch.bundled.objects.draw import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family, finish
-from advsearch.bundled.objects.shapes import (
-    Array,
-    Patch,
-    at_height,
-    dense,
-    ellipse,
-    lathe,
-    placed,
-    rectangle,
-    rotation,
-    rounded,
-    spline,
-    sweep,
-    upright,
-    vessel,
-)
+from advsearch.bundled.objects.shapes import Array, Patch
 from advsearch.bundled.objects.textures import (
     Paint,
     Texels,
@@ -44,7 +30,7 @@ from advsearch.bundled.objects.textures import (
     zigzag,
 )
 
-BACK = rotation("z", 220.0)  # turns the seam of a lathe away from the default camera, at azimuth 40
+BACK = shapes.rotation("z", 220.0)  # turns the seam of a lathe away from the default camera, at azimuth 40
 
 
 def handle(draw: Draw, style: str, low: float, high: float, reach: float, profile: Array, inset: float) -> list[Patch]:
@@ -59,11 +45,11 @@ def handle(draw: Draw, style: str, low: float, high: float, reach: float, profil
         profile: (K, 2) of the wall that it stands on.
         inset: how deep in the wall its roots are.
     """
-    at_low, at_high = (at_height(profile, z) - inset for z in (low, high))
+    at_low, at_high = (shapes.at_height(profile, z) - inset for z in (low, high))
     edge = max(at_low, at_high)
     if style == "square":
         corners = [(at_high, high), (edge + reach, high), (edge + reach, low), (at_low, low)]
-        curve = spline(dense(rounded(corners, 0.45 * reach, 6), 0.8), 26)
+        curve = shapes.spline(shapes.dense(shapes.rounded(corners, 0.45 * reach, 6), 0.8), 26)
     else:
         tops = {"round": (0.82, 0.98, 0.82), "ear": (0.98, 0.9, 0.5), "loop": (0.85, 1.0, 0.85)}[style]
         span = high - low
@@ -72,11 +58,15 @@ def handle(draw: Draw, style: str, low: float, high: float, reach: float, profil
             (edge + tops[1] * reach, (low + high) / 2), (edge + tops[2] * reach, low + 0.18 * span),
             (edge + 0.3 * reach, low + 0.03 * span), (at_low, low),
         ]  # fmt: skip
-        curve = spline(knots, 26)
+        curve = shapes.spline(knots, 26)
     thick, broad = draw(0.42, 0.32, 0.6), draw(0.62, 0.4, 0.95)
     flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(curve))) ** 4
-    section = ellipse(thick, broad, 16) if draw.chance(0.7, True) else rectangle(2 * thick, 2 * broad, 0.6 * thick)
-    return sweep("handle", upright(curve), section, flare)
+    section = (
+        shapes.ellipse(thick, broad, 16)
+        if draw.chance(0.7, True)
+        else shapes.rectangle(2 * thick, 2 * broad, 0.6 * thick)
+    )
+    return shapes.sweep("handle", shapes.upright(curve), section, flare)
 
 
 def _ceramic(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
@@ -112,9 +102,9 @@ def mug(draw: Draw) -> Instance:
     belly = draw(0.0, -0.06, 0.13) * top
     wall, low = draw(0.36, 0.28, 0.5), draw(0.7, 0.3, 1.2)
     corners = [(foot - low, 0.0), (foot, low), (0.5 * (foot + top) + belly, 0.5 * height), (top, height)]
-    side = spline(np.array(corners[1:]), 14)
+    side = shapes.spline(np.array(corners[1:]), 14)
     outside = np.concatenate([[corners[0], (foot - 0.3 * low, 0.25 * low)], side])
-    body = vessel(outside, wall, draw(0.6, 0.5, 0.9))
+    body = shapes.vessel(outside, wall, draw(0.6, 0.5, 0.9))
 
     style = draw.pick("ear", "round", "square", "loop")
     grip_high = height * draw(0.85, 0.76, 0.88)
@@ -138,7 +128,7 @@ def mug(draw: Draw) -> Instance:
         "base": raw,
         "handle": draw.pick(glaze, outer, accent),
     }
-    patches = placed([*body, *placed(grip, rotation("z", -108.0))], BACK)
+    patches = shapes.placed([*body, *shapes.placed(grip, shapes.rotation("z", -108.0))], BACK)
     return Instance(patches, paints, finish(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6})
 
 
@@ -154,23 +144,22 @@ def bowl(draw: Draw) -> Instance:
         (foot * 1.04, ring), (radius * 0.5 * (0.72 + full) * 0.92, ring + 0.22 * (height - ring)),
         (radius * full, 0.55 * height), (radius * (0.5 + 0.5 * full), 0.8 * height), (radius + flare, height),
     ]  # fmt: skip
-    body = vessel(np.array([(foot, 0.0), *spline(knots, 22)]), draw(0.45, 0.32, 0.65), ring + 0.55, step=0.9)
+    body = shapes.vessel(
+        np.array([(foot, 0.0), *shapes.spline(knots, 22)]), draw(0.45, 0.32, 0.65), ring + 0.55, step=0.9
+    )
     offset = draw.offset()
     clay = draw.colour("3f7f86", "e9dfca", "2f5d7c", "b5442e", "f3f1ec", "566b3f")
     glaze = clouded(clay, 0.72, 2.6, offset)
     accent = mottled(hexed("e8dcc0"), hexed("d6c39a"), 2.0, offset)
-    outer = natural(draw, 2 * radius, _bowl_paint(draw, height, glaze, accent))
-    inner = draw.pick(accent, glaze, outer, solid(draw.colour("f3f1ec")), rings(clay, shade(clay, 1.3), height * 0.2))
     raw = solid("9b7352")
+    if draw.rng is None:
+        rim = over(glaze, between(0.93 * height, 2 * height, soft=0.25), accent)
+        outer = over(rim, between(-1.0, 0.55, soft=0.1), raw)
+    else:
+        outer = natural(draw, 2 * radius, _ceramic(draw, height, glaze, accent))
+    inner = draw.pick(accent, glaze, outer, solid(draw.colour("f3f1ec")), rings(clay, shade(clay, 1.3), height * 0.2))
     paints = {"outside": outer, "inside": inner, "base": raw}
-    return Instance(placed(body, BACK), paints, finish(draw, 0.28, 0.5), {"base": 0.6})
-
-
-def _bowl_paint(draw: Draw, height: float, glaze: Paint, accent: Paint) -> Paint:
-    if draw.rng is not None:
-        return _ceramic(draw, height, glaze, accent)
-    rim = over(glaze, between(0.93 * height, 2 * height, soft=0.25), accent)
-    return over(rim, between(-1.0, 0.55, soft=0.1), solid("9b7352"))
+    return Instance(shapes.placed(body, BACK), paints, finish(draw, 0.28, 0.5), {"base": 0.6})
 
 
 @family(metres=0.01)
@@ -186,12 +175,12 @@ def bottle(draw: Draw) -> Instance:
         (neck + (radius - neck) * (0.55 - 0.35 * slope), shoulder + rise * (0.6 - 0.25 * slope)),
         (neck * 1.03, shoulder + rise), (neck * 0.95, height - 1.6),
     ]  # fmt: skip
-    curve = rounded(corners, [0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], 7)
+    curve = shapes.rounded(corners, [0.8, 0.45 * rise + 0.4, 0.6 * rise, 0.5 * rise], 7)
     wide = neck * 0.95 + draw(0.28, 0.1, 0.4)
     ring = [(wide, height - 1.5), (wide, height - 0.6), (neck * 0.97, height - 0.5), (neck * 0.93, height)]
     capped = draw.chance(0.4)
-    outside = np.concatenate([dense(curve, 1.6), ring])
-    patches = vessel(outside, draw(0.35, 0.3, 0.45), 0.8, step=1.6, columns=48)
+    outside = np.concatenate([shapes.dense(curve, 1.6), ring])
+    patches = shapes.vessel(outside, draw(0.35, 0.3, 0.45), 0.8, step=1.6, columns=48)
     if capped:
         patches += _cap(draw, wide + 0.12, height)
     offset = draw.offset()
@@ -210,15 +199,17 @@ def bottle(draw: Draw) -> Instance:
         "base": solid(glass),
         "cap": solid(draw.colour("c9a24b", "d0d0d0", "b5442e", "22262b")),
     }
-    return Instance(placed(patches, BACK), paints, finish(draw, 0.2, 0.6), {"inside": 0.25, "base": 0.5})
+    return Instance(shapes.placed(patches, BACK), paints, finish(draw, 0.2, 0.6), {"inside": 0.25, "base": 0.5})
 
 
 def _cap(draw: Draw, radius: float, height: float) -> list[Patch]:
     """A screw cap or crown over the mouth."""
     low, top = height - draw(1.5, 0.9, 2.2), height + 0.35
     under = np.array([[0.6 * radius, low], [radius, low]])
-    side = rounded([(radius, low), (radius, top), (0.6 * radius, top)], 0.3, 4)
-    return lathe([("cap", under), ("cap", dense(side, 0.8)), ("cap", [[0.6 * radius, top], [0.0, top]])], 40)
+    side = shapes.rounded([(radius, low), (radius, top), (0.6 * radius, top)], 0.3, 4)
+    return shapes.lathe(
+        [("cap", under), ("cap", shapes.dense(side, 0.8)), ("cap", [[0.6 * radius, top], [0.0, top]])], 40
+    )
 
 
 def _labelled(draw: Draw, surface: Paint, paper: Array, ink: Array, low: float, high: float) -> Paint:
@@ -255,18 +246,18 @@ def vase(draw: Draw) -> Instance:
         (foot, 0.0), (foot * 0.97, 0.5), (0.45 * foot + 0.55 * belly, 0.48 * belly_at), (belly, belly_at),
         (0.45 * belly + 0.55 * neck, 0.45 * belly_at + 0.55 * neck_at), (neck, neck_at), (lip, height),
     ]  # fmt: skip
-    profile = spline(knots, 34)
-    patches = vessel(profile, draw(0.4, 0.35, 0.6), 0.8, step=1.2)
+    profile = shapes.spline(knots, 34)
+    patches = shapes.vessel(profile, draw(0.4, 0.35, 0.6), 0.8, step=1.2)
     if draw.chance(0.25):
         low, high = belly_at + 0.15 * (neck_at - belly_at), neck_at - 0.2
         ear = handle(draw, "ear", low, high, draw(1.6, 1.2, 2.4), profile, 0.2)
-        patches += [*placed(ear, rotation("z", 130.0)), *placed(ear, rotation("z", -50.0))]
+        patches += [*shapes.placed(ear, shapes.rotation("z", 130.0)), *shapes.placed(ear, shapes.rotation("z", -50.0))]
     offset = draw.offset()
     clay = draw.colour("f2f1ea", "b7562f", "2f6f6a", "26303c", "d9c7a5", "8a2f2a")
     glaze = clouded(clay, 0.95, 4.0, offset)
     outer = natural(draw, height, _vase_paint(draw, glaze, height, offset))
     paints = {"outside": outer, "inside": solid(shade(clay, 0.8)), "base": solid("b79b7c"), "handle": glaze}
-    return Instance(placed(patches, BACK), paints, finish(draw, 0.25, 0.6), {"inside": 0.35, "base": 0.5})
+    return Instance(shapes.placed(patches, BACK), paints, finish(draw, 0.25, 0.6), {"inside": 0.35, "base": 0.5})
 
 
 def _vase_paint(draw: Draw, glaze: Paint, height: float, offset: Array) -> Paint:
@@ -306,7 +297,7 @@ def wine_glass(draw: Draw) -> Instance:
         (0.5 * bowl, stem_top + 0.07 * deep), (0.86 * bowl, stem_top + 0.2 * deep), (bowl, stem_top + wide_at * deep),
         (0.45 * bowl + 0.55 * mouth, stem_top + 0.76 * deep), (mouth, stem_top + deep),
     ]  # fmt: skip
-    outer = spline([(stem, 0.6 * stem_top), *neck, *cup], 36)
+    outer = shapes.spline([(stem, 0.6 * stem_top), *neck, *cup], 36)
     normal = np.gradient(outer, axis=0)
     normal = np.stack([normal[:, 1], -normal[:, 0]], axis=1) / np.linalg.norm(normal, axis=1, keepdims=True)
     inner = (outer - wall * normal)[::-1]
@@ -318,13 +309,13 @@ def wine_glass(draw: Draw) -> Instance:
     floor = stem_top + 0.08 * deep
     edge = (inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))
     profile = [
-        ("foot", dense(under, 1.5)),
-        ("foot", np.array([under[-1], (foot, 0.08), *spline(rising, 14)])),
+        ("foot", shapes.dense(under, 1.5)),
+        ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, 14)])),
         ("bowl", np.concatenate([outer, lip, inner[:1]])),
         ("inside", inner),
         ("inside", np.array([inner[-1], edge, (0.0, floor)])),
     ]
-    body = lathe(profile, 52)
+    body = shapes.lathe(profile, 52)
     height = stem_top + deep
     tint = draw.colour("c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3)
     drink = draw.colour("6d1526", "d8b45a", "c46a6a", "3f1420", wild=0.15)
@@ -340,4 +331,4 @@ def wine_glass(draw: Draw) -> Instance:
         outside = over(outside, between(height - 0.35, 2 * height, soft=0.1), solid("c9a24b"))
     foot_paint = draw.pick(plain, outside, plain) if draw.chance(0.7, True) else anything(draw, height)
     paints = {"foot": foot_paint, "bowl": outside, "inside": inside}
-    return Instance(placed(body, BACK), paints, finish(draw, 0.18, 0.8, spread=0.12))
+    return Instance(shapes.placed(body, BACK), paints, finish(draw, 0.18, 0.8, spread=0.12))

@@ -82,7 +82,7 @@ class RecipeConfig(Config):
     )(lambda value, info: SceneConfig._as_text(value, info))
     _prompts = field_validator("prompt", mode="before")(lambda value: SceneConfig._prompts_as_text(value))
     _sized = field_validator("resolution", mode="before")(lambda value: SceneConfig._resolution_from_text(value))
-    _in_range = field_validator("resolution")(lambda value, info: SceneConfig._in_range(value, info))
+    _sides_in_range = field_validator("resolution")(lambda value: SceneConfig._sides_in_range(value))
     _task = field_validator("task", mode="before")(lambda value: read_joined(value, "task", "classification"))
 
     @field_validator("photographs")

@@ -13,6 +13,7 @@ from advsearch import seeds
 from advsearch.attacks.domain import batches
 from advsearch.attacks.evaluation import most_at_once
 from advsearch.attacks.trials import clopper_pearson
+from advsearch.described import OUT_OF_VIEW
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
@@ -109,7 +110,8 @@ def _grown(verifier: Verifier, config: RegionConfig, varied: Varied, run: RunDir
     def same(values: Tensor, number: int) -> bool:
         predictor = None if checking else light
         (trial,) = verifier.trials("region", {number: varied.at(values)}, sought=False, predictor=predictor)
-        return trial.success == verdict and not trial.not_a_number
+        seen = trial.prediction.label != OUT_OF_VIEW  # a picture without the object is neither right nor wrong
+        return seen and trial.success == verdict and not trial.not_a_number
 
     seed, centre = seeds.stream(config.seed, "region"), varied.centre[varied.places]
     grown = grow(same, centre, seed=seed, samples=config.samples, on_check=on_check)
@@ -180,9 +182,15 @@ def _varied(problem: Problem, config: RegionConfig) -> Varied:
 def _verdict(verifier: Verifier, centre: Tensor) -> bool:
     """Whether the model is wrong at the centre; refuses where that depends on the noise, or is not a number."""
     verifier.stages.begin("verification", "looking at the centre", AT_CENTRE)
-    wrong = nothing = 0
+    wrong = nothing = hidden = 0
     for trial in verifier.trials("centre", dict.fromkeys(range(AT_CENTRE), centre), sought=False):
         wrong, nothing = wrong + trial.success, nothing + trial.not_a_number
+        hidden += trial.prediction.label == OUT_OF_VIEW
+    if hidden:
+        raise InputError(
+            f"the object is not to be seen in {hidden} of {AT_CENTRE} trials at the centre, so there is no verdict; "
+            "choose another centre"
+        )
     if nothing:
         raise InputError(
             f"the model's prediction is not a number in {nothing} of {AT_CENTRE} trials at the centre, so there is no "

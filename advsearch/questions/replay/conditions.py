@@ -123,7 +123,7 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
         yield Way("sensor", name, same(change=_sensor(values)), shares=True)
 
     def by_blender(name: str) -> RetrialCondition:
-        return RetrialCondition(name, replace(problem, renderer=renderer.rendered_by(made.radiance)), spp, "blender")
+        return RetrialCondition(name, replace(problem, renderer=renderer.like(source=made.radiance)), spp, "blender")
 
     denoise, missing = formation.denoiser != "none", ""
     try:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
-from advsearch.cli.main import Positional, QuestionCommand
+from advsearch.cli.main import QuestionCommand
 from advsearch.cli.output import at_work
 from advsearch.errors import InputError
 
@@ -46,4 +46,4 @@ class _Test(QuestionCommand):
         return output.finish(result, self.text, as_json=as_json) or result.status
 
 
-COMMAND = _Test("test", about="suite", place=Positional("SUITE", "a suite, a YAML file"), examples=EXAMPLES)
+COMMAND = _Test("test", about="suite", expected=("SUITE", "a suite, a YAML file"), examples=EXAMPLES)

@@ -282,13 +282,14 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
 def valued(
     claim: ShareClaim | NoWorseClaim, own: Evaluation, its: Evaluation | None
 ) -> tuple[float | None, float, str]:
-    """Return what a picture says for a claim, from 0 to 1, or None where it does not count; how bad an example it is of
-    what is against it, and which."""
+    """Return what a picture says for a claim, from 0 to 1, or None where the object is not to be seen; how bad an
+    example it is of what is against it, and which."""
     before = own.said.prediction
+    if before.label == OUT_OF_VIEW:
+        return None, 0.0, ""
     if its is None:
-        value = None if before.label == OUT_OF_VIEW else float(own.said.right)
         badness = own.said.score if math.isfinite(own.said.score) else -math.inf
-        return value, badness, f"most wrong where it says {before.label}"
+        return float(own.said.right), badness, f"most wrong where it says {before.label}"
     if isinstance(claim, ChangeClaim):
         after = its.said.prediction
         text = f"{before.label} before and {after.label} after"

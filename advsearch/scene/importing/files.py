@@ -14,6 +14,7 @@ import subprocess
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -72,7 +73,12 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
             )
         data = files.read_bytes(path, f"an {what} file", LARGEST_FILE)
     except FileNotFoundError as error:
-        raise FileFormatError(f"{path}: no such {what} file.{_near(path, suffixes)} Check the path") from error
+        hint = "" if path.parent.is_dir() else f" The folder {path.parent} does not exist either."
+        with suppress(OSError):
+            beside = {file.name.lower(): file.name for file in path.parent.iterdir() if file.suffix.lower() in suffixes}
+            near = difflib.get_close_matches(path.name.lower(), sorted(beside), n=3, cutoff=0.5)
+            hint = f" Did you mean {' or '.join(repr(beside[name]) for name in near)}?" if near else ""
+        raise FileFormatError(f"{path}: no such {what} file.{hint} Check the path") from error
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise FileFormatError(f"{path}: the {what} file cannot be read ({reason}); check its permissions") from error
@@ -154,18 +160,6 @@ class Names:
 def clean(name: str) -> str:
     """Return a name of letters, digits, dashes and underscores, 60 at most."""
     return re.sub(r"[^\w-]+", "-", name).strip("-")[:60] or "part"
-
-
-def _near(path: Path, suffixes: Sequence[str]) -> str:
-    """Return a sentence with similar file names in the same folder, or about the folder when that is missing too."""
-    if not path.parent.is_dir():
-        return f" The folder {path.parent} does not exist either."
-    try:
-        names = {entry.name.lower(): entry.name for entry in path.parent.iterdir() if entry.suffix.lower() in suffixes}
-    except OSError:
-        return ""
-    near = difflib.get_close_matches(path.name.lower(), sorted(names), n=3, cutoff=0.5)
-    return f" Did you mean {' or '.join(repr(names[name]) for name in near)}?" if near else ""
 
 
 LARGEST_FACES = 2_000_000

@@ -79,7 +79,12 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
     if not 0.0 < size < np.inf:
         what = "all vertices coincide" if size == 0.0 else "its extent is too large to compute with"
         raise InputError(f"{source}: expected an object with a size, got a mesh in which {what}; export it again")
-    points, index = _welded((vertices - low) / size @ turn.T)
+    points, index = np.unique((vertices - low) / size @ turn.T + 0.0, axis=0, return_inverse=True)
+    index, pairs = index.reshape(-1), cKDTree(points).query_pairs(WELD, output_type="ndarray")
+    if len(pairs):
+        cluster = connected(len(points), pairs[:, 0], pairs[:, 1])
+        _, first, merged = np.unique(cluster, return_index=True, return_inverse=True)
+        points, index = points[first], merged[index].astype(np.int64)
     counts = [len(part.faces) for part in parts]
     return Soup(
         points=points,
@@ -135,19 +140,16 @@ def assemble(soup: Soup) -> tuple[Mesh, Ints | None]:
 
 
 def _wound(soup: Soup, notes: Notes) -> Soup:
-    """Turn faces over until neighbours agree and closed shells, and sheets with normals, face outwards."""
-    left, right, same_way = neighbours(soup.faces)
-    turn, shell, twisted = _agreement(np.linalg.norm(soup.face_vectors(), axis=1), left, right, same_way)
+    turn, shell, twisted = _agreement(soup)
     if turn.any():
         notes.say(f"{int(turn.sum())} faces wound against their neighbours were turned over")
     if twisted:
         notes.say("has a one-sided surface (a Moebius strip), so some faces show their backs")
     soup = soup.reversed(turn)
-    paired = np.bincount(shell[neighbours(soup.faces)[0] // 3], minlength=int(shell.max()) + 1) * 2
-    inside_out = _inside_out(soup, shell, np.equal(paired, 3 * np.bincount(shell)))
+    inside_out = _inside_out(soup, shell)[shell]
     if inside_out.any():
-        notes.say(f"{int(inside_out[shell].sum())} faces were inside out and have been turned over")
-    return soup.reversed(inside_out[shell])
+        notes.say(f"{int(inside_out.sum())} faces were inside out and have been turned over")
+    return soup.reversed(inside_out)
 
 
 def neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
@@ -165,11 +167,13 @@ def neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
     return left, right, start[left] == start[right]
 
 
-def _agreement(area: Doubles, left: Ints, right: Ints, same_way: Bools) -> tuple[Bools, Ints, bool]:
+def _agreement(soup: Soup) -> tuple[Bools, Ints, bool]:
     """Return which faces (F,) to turn over so that neighbours agree, keeping the way of most of each shell's area; the
     shell that each belongs to (F,); and whether some shell is one-sided. Every face stands for two nodes of a graph,
     "as it is" and "turned"; neighbours that agree are linked like to like, others crosswise. A shell is orientable when
     the two nodes of its faces fall into two components."""
+    left, right, same_way = neighbours(soup.faces)
+    area = np.linalg.norm(soup.face_vectors(), axis=1)
     f, g, count = left // 3, right // 3, len(area)
     a = np.concatenate([2 * f, 2 * f + 1])
     b = np.concatenate([2 * g + same_way, 2 * g + 1 - same_way])
@@ -181,14 +185,16 @@ def _agreement(area: Doubles, left: Ints, right: Ints, same_way: Bools) -> tuple
     return turn, shell.astype(np.int64), bool((kept == turned).any())
 
 
-def _inside_out(soup: Soup, shell: Ints, closed: Bools) -> Bools:
+def _inside_out(soup: Soup, shell: Ints) -> Bools:
     """Return, for each shell, whether it must be turned over: a closed shell, all of whose edges belong to exactly two
     faces of it, when its signed volume is negative, unless it lies within another closed shell (then it is the wall of
     a hollow) and the file's normals do not object; an open sheet when the file's normals point away from its front."""
-    count, vectors = len(closed), soup.face_vectors()
+    faces, vectors = np.bincount(shell), soup.face_vectors()
+    count, paired = len(faces), np.bincount(shell[neighbours(soup.faces)[0] // 3], minlength=len(faces)) * 2
+    closed = np.equal(paired, 3 * faces)
     corners = soup.points[soup.faces]
     sums = [np.bincount(shell, weights=place) for place in corners.mean(axis=1).T]
-    middle = np.stack(sums, axis=1) / np.bincount(shell)[:, None]
+    middle = np.stack(sums, axis=1) / faces[:, None]
     volume = np.bincount(shell, weights=((corners[:, 0] - middle[shell]) * vectors).sum(axis=1), minlength=count)
     toward = np.nan_to_num((soup.normals * vectors[:, None]).sum(axis=2)).sum(axis=1)
     agreement = np.bincount(shell, weights=toward, minlength=count)  # with the file's normals; 0 where it has none
@@ -207,7 +213,6 @@ def _inside_out(soup: Soup, shell: Ints, closed: Bools) -> Bools:
 
 
 def _shaded(soup: Soup, notes: Notes) -> Soup:
-    """Keep the file's normals where they are sound, and compute the others."""
     vectors = soup.face_vectors()
     area = np.linalg.norm(vectors, axis=1)
     known = np.isfinite(soup.normals).all(axis=2)
@@ -251,19 +256,7 @@ def smooth_normals(soup: Soup) -> Doubles:
     return np.where(sound, smooth, unit[:, None])
 
 
-def _welded(points: Doubles) -> tuple[Doubles, Ints]:
-    """Merge points closer than `WELD`; return the merged points, and for each old point its new index."""
-    unique, index = np.unique(points + 0.0, axis=0, return_inverse=True)
-    pairs = cKDTree(unique).query_pairs(WELD, output_type="ndarray")
-    if not len(pairs):
-        return unique, index.reshape(-1)
-    cluster = connected(len(unique), pairs[:, 0], pairs[:, 1])
-    _, first, merged = np.unique(cluster, return_index=True, return_inverse=True)
-    return unique[first], merged[index.reshape(-1)].astype(np.int64)
-
-
 def _corners(values: Doubles | None, faces: Ints, width: int) -> Doubles:
-    """Spread per-vertex values to the corners of faces; NaN where there are none."""
     return np.full((len(faces), 3, width), np.nan) if values is None else values[faces]
 
 
@@ -348,7 +341,6 @@ def _flattened(corners: Doubles) -> Doubles:
 
 
 def _doubled_areas(a: Doubles, b: Doubles, c: Doubles) -> Doubles:
-    """Return twice the signed areas of triangles in the plane, (..., 2) each."""
     ahead, aside = b - a, c - a
     return np.asarray(ahead[..., 0] * aside[..., 1] - ahead[..., 1] * aside[..., 0])
 

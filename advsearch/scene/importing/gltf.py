@@ -5,15 +5,14 @@ from __future__ import annotations
 import base64
 import json
 import struct
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import product
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote_to_bytes
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from advsearch import files
 from advsearch.errors import FileFormatError
@@ -29,7 +28,7 @@ from advsearch.scene.importing.files import (
     shown,
     text_of,
 )
-from advsearch.scene.importing.gltf_entries import Asset, Header, Primitive, TextureUse
+from advsearch.scene.importing.gltf_entries import Asset, Entry, Header, Primitive
 
 MOST_VALUES = 1_000_000
 """Lists, objects and values in a header; each takes hundreds of bytes of memory, and may take two of the file."""
@@ -39,7 +38,7 @@ def read_header(path: Path, data: bytes) -> Header:
     """Return the header of a .gltf or .glb file. Raises FileFormatError: the file is not glTF, is shorter than it says,
     has other types in its header than glTF has, refers to what is not there, is over a limit, or needs what is not
     supported."""
-    chunk = data if path.suffix.lower() == ".gltf" else _json_chunk(path, data).rstrip(b"\0")  # some pad with zeros
+    chunk = _chunks(path, data)[0]
     text = text_of(chunk)
     check_most(path, sum(map(text.count, ",[{")), MOST_VALUES, "a glTF header of at most {} values", "more")
     try:
@@ -57,7 +56,13 @@ def read_header(path: Path, data: bytes) -> Header:
             raise damaged(path, "glTF of version 2", f"version {shown(version)}")
         header = Header.model_validate(content)
     except ValidationError as error:
-        raise damaged(path, *_first(error)) from None
+        first = error.errors(include_url=False)[0]
+        place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+        if first["type"] == "missing":
+            raise damaged(path, f"glTF with {place}", "nothing") from None
+        needed = first["msg"].removeprefix("Input should be ").removeprefix("Field ")
+        got = shown(json.dumps(first["input"], default=str))
+        raise damaged(path, f"glTF whose {place} is {needed}", got) from None
     extensions: set[str] = set()
     level: list[JsonValue] = [content]
     while level:
@@ -78,16 +83,10 @@ def read_header(path: Path, data: bytes) -> Header:
     return header
 
 
-def binary_chunk(data: bytes) -> bytes | None:
-    """Return what follows the header of a .glb file, as `read_header` has accepted it; None where nothing does."""
-    start, end = 20 + struct.unpack_from("<I", data, 12)[0], struct.unpack_from("<I", data, 8)[0]
-    if start + 8 > end:
-        return None
-    size, kind = struct.unpack_from("<I4s", data, start)
-    return data[start + 8 : min(start + 8 + size, end)] if kind == b"BIN\0" else None
-
-
-def _json_chunk(path: Path, data: bytes) -> bytes:
+def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
+    """Return the header of a file as text, and what follows it in a .glb file; None where nothing does."""
+    if path.suffix.lower() == ".gltf":
+        return data, None
     if not data.startswith(b"glTF") or len(data) < 20:
         got = "the first few bytes of one" if data.startswith(b"glTF") else looks_like(data)
         raise damaged(path, "a binary glTF file", got)
@@ -98,16 +97,11 @@ def _json_chunk(path: Path, data: bytes) -> bytes:
         raise damaged(path, f"{length} bytes, as its header says", f"{len(data)}; the file is cut short")
     if kind != b"JSON" or 20 + chunk > length:
         raise damaged(path, "a chunk of JSON first", f"{chunk} bytes of {shown(kind.decode('latin-1'))}")
-    return data[20 : 20 + chunk]
-
-
-def _first(error: ValidationError) -> tuple[str, str]:
-    """Return what the first entry of the wrong type should be, and what it is."""
-    first = error.errors(include_url=False)[0]
-    place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
-    needed = first["msg"].removeprefix("Input should be ").removeprefix("Field ")
-    got = "nothing" if first["type"] == "missing" else shown(json.dumps(first["input"], default=str))
-    return f"glTF whose {place} is {needed}" if got != "nothing" else f"glTF with {place}", got
+    start, rest = 28 + chunk, None
+    if start <= length:
+        size, kind = struct.unpack_from("<I4s", data, start - 8)
+        rest = data[start : min(start + size, length)] if kind == b"BIN\0" else None
+    return data[20 : 20 + chunk].rstrip(b"\0"), rest  # some pad with zeros
 
 
 LARGEST_VALUES = 1 << 28
@@ -129,9 +123,14 @@ def check_header(path: Path, header: Header) -> None:
     needed = sorted(name for name in header.extensionsRequired if name not in READ and not name.startswith(_LOOKS))
     if needed:
         raise _needs(path, needed)
-    for kind, index, count in _references(header):
-        if index >= count:
-            raise damaged(path, f"glTF with {index + 1} {kind}, as it refers to", f"{count}")
+    for entry in header.entries():
+        for kind, index in entry.references():
+            if index >= (count := len(getattr(header, kind))):
+                raise damaged(path, f"glTF with {index + 1} {kind}, as it refers to", f"{count}")
+    for animation in header.animations:
+        most, count = max((channel.curve for channel in animation.channels), default=-1), len(animation.samplers)
+        if most >= count:
+            raise damaged(path, f"glTF with {most + 1} samplers of an animation, as it refers to", f"{count}")
     size = max(sum(view.byteLength for view in header.bufferViews), sum(a.size() for a in header.accessors))
     check_most(path, size, LARGEST_VALUES, "geometry and pictures of at most {} bytes")
     for mesh in header.meshes:
@@ -145,49 +144,9 @@ def _needs(path: Path, names: Iterable[str]) -> FileFormatError:
     return FileFormatError(f"{path}: needs {named}, which is not supported; export it without that option")
 
 
-def _unread_extensions(entry: BaseModel) -> list[str]:
+def _unread_extensions(entry: Entry) -> list[str]:
     held = (entry.model_extra or {}).get("extensions")
     return sorted(name for name in held if name not in READ) if isinstance(held, dict) else []
-
-
-def _references(header: Header) -> Iterator[tuple[str, int, int]]:
-    """Yield every number by which the header refers to another entry: the kind, the number and how many there are."""
-    sparse = [values.sparse for values in header.accessors if values.sparse]
-    looks = [(*vars(look.surface).values(), look.normalTexture, look.emissiveTexture) for look in header.materials]
-    primitives = [primitive for mesh in header.meshes for primitive in mesh.primitives]
-    channels = [channel for animation in header.animations for channel in animation.channels]
-    samplers = [sampler for animation in header.animations for sampler in animation.samplers]
-    table: Sequence[tuple[Iterable[object], dict[str, str]]] = (
-        (header.bufferViews, {"buffer": "buffers"}),
-        (header.skins, {"inverseBindMatrices": "accessors", "joints": "nodes"}),
-        ([*header.accessors, *header.images], {"bufferView": "bufferViews"}),
-        ([part for held in sparse for part in (held.indices, held.values)], {"bufferView": "bufferViews"}),
-        (header.textures, {"image": "images", "sampler": "samplers"}),
-        ([use for uses in looks for use in uses if isinstance(use, TextureUse)], {"index": "textures"}),
-        (primitives, {"attributes": "accessors", "indices": "accessors", "targets": "accessors"}),
-        (primitives, {"material": "materials"}),
-        (samplers, {"input": "accessors", "output": "accessors"}),
-        ([*(channel.target for channel in channels), *header.vrm.values(), *header.vrm_0], {"node": "nodes"}),
-        (header.nodes, {"mesh": "meshes", "skin": "skins", "camera": "cameras", "lamp": "lights", "children": "nodes"}),
-        (header.scenes, {"nodes": "nodes"}),
-        ([header], {"scene": "scenes"}),
-    )
-    for entries, fields in table:
-        for entry, (name, kind) in product(entries, fields.items()):
-            for index in _numbers(getattr(entry, name)):
-                yield kind, index, len(getattr(header, kind))
-    for animation in header.animations:
-        for channel in animation.channels:
-            yield "samplers of an animation", channel.sampler, len(animation.samplers)
-
-
-def _numbers(held: Any) -> Iterator[int]:
-    """Yield a number, or those in lists and dictionaries; none of None."""
-    if isinstance(held, int):
-        yield held
-    else:
-        for inner in held.values() if isinstance(held, dict) else held or ():
-            yield from _numbers(inner)
 
 
 def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
@@ -212,26 +171,22 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
 
 
 def _check_tree(path: Path, header: Header) -> None:
-    """Check that the nodes form trees, as glTF demands, and neither too large nor too deep ones."""
-
     def triangles_of(primitive: Primitive) -> int:  # at most
         index = primitive.attributes.get("POSITION") if primitive.indices is None else primitive.indices
         count = 0 if index is None or primitive.mode < 4 else header.accessors[index].count
         return count // 3 if primitive.mode == 4 else max(0, count - 2)
 
-    parents: set[int] = set()
     triangles = [sum(map(triangles_of, mesh.primitives)) for mesh in header.meshes]
-    pieces, drawn = 0, 0
-    for node in header.nodes:
-        if node.mesh is not None:
-            pieces, drawn = pieces + len(header.meshes[node.mesh].primitives), drawn + triangles[node.mesh]
-        for child in node.children:
-            if child in parents:
-                raise damaged(path, "nodes with one parent each", f"two for node {child}")
-            parents.add(child)
-    pieces = max(pieces, sum(len(mesh.primitives) for mesh in header.meshes), len(header.nodes))
-    check_faces(path, max(drawn, sum(triangles)))
-    check_most(path, pieces, LARGEST_TREE, "glTF of at most {} nodes and pieces")
+    pieces = [len(mesh.primitives) for mesh in header.meshes]
+    drawn = [node.mesh for node in header.nodes if node.mesh is not None]
+    parents: set[int] = set()
+    for child in [child for node in header.nodes for child in node.children]:
+        if child in parents:
+            raise damaged(path, "nodes with one parent each", f"two for node {child}")
+        parents.add(child)
+    check_faces(path, max(sum(triangles[mesh] for mesh in drawn), sum(triangles)))
+    most = max(sum(pieces[mesh] for mesh in drawn), sum(pieces), len(header.nodes))
+    check_most(path, most, LARGEST_TREE, "glTF of at most {} nodes and pieces")
     level, reached, depth = [index for index in range(len(header.nodes)) if index not in parents], 0, 0
     while level:
         check_most(path, depth + 1, DEEPEST_TREE, "nodes of at most {} levels", "more")
@@ -250,7 +205,7 @@ class GltfFile:
 
     def __init__(self, path: Path, data: bytes) -> None:
         self.path, self.header, self.references = path, read_header(path, data), References(path)
-        self._chunk = None if path.suffix.lower() == ".gltf" else binary_chunk(data)
+        self._chunk = _chunks(path, data)[1]
         self._read: dict[int, bytes] = {}
         self._put_in: dict[int, npt.NDArray[Any]] = {}
 
@@ -266,14 +221,8 @@ class GltfFile:
     def view(self, index: int) -> memoryview:
         """Return the bytes of a view. Raises FileFormatError: they are not there."""
         view = self.header.bufferViews[index]
-        data, end = self._buffer(view.buffer), view.byteOffset + view.byteLength
-        if end > len(data):
-            raise damaged(self.path, f"a buffer of at least {end:,} bytes", f"{len(data):,}; the file is cut short")
-        return memoryview(data)[view.byteOffset : end]
-
-    def _buffer(self, number: int) -> bytes:
+        number, uri = view.buffer, self.header.buffers[view.buffer].uri
         if number not in self._read:
-            uri = self.header.buffers[number].uri
             try:
                 if uri is None and (number > 0 or self._chunk is None):
                     views = [view for view in self.header.bufferViews if view.buffer == number]
@@ -288,7 +237,10 @@ class GltfFile:
                 raise FileFormatError(message) from None
             except ValueError:
                 raise damaged(self.path, f"a buffer {number} in base64", "other text") from None
-        return self._read[number]
+        data, end = self._read[number], view.byteOffset + view.byteLength
+        if end > len(data):
+            raise damaged(self.path, f"a buffer of at least {end:,} bytes", f"{len(data):,}; the file is cut short")
+        return memoryview(data)[view.byteOffset : end]
 
     def values(self, index: int) -> npt.NDArray[Any]:
         """Return the values (count, width) of an accessor as they are stored, those that are sparse put in. Raises

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, FailFast, Field, JsonValue
@@ -19,10 +19,41 @@ _COMPONENTS = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _ELEMENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 
-class _Entry(BaseModel):
+REFERENCES = {
+    **dict.fromkeys(("attributes", "indices", "targets", "input", "output", "inverseBindMatrices"), "accessors"),
+    **dict.fromkeys(("children", "joints", "node", "nodes"), "nodes"),
+    **dict.fromkeys(("source", "webp"), "images"),
+    **{"buffer": "buffers", "bufferView": "bufferViews", "camera": "cameras", "index": "textures", "lamp": "lights"},
+    **{"material": "materials", "mesh": "meshes", "sampler": "samplers", "scene": "scenes", "skin": "skins"},
+}
+"""What of the header the numbers in a field refer to."""
+
+
+class Entry(BaseModel):
     """A JSON object of glTF; what it holds beyond the fields is kept as `model_extra`, to be named as left out."""
 
     model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False, frozen=True)
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield this entry, and all that it consists of."""
+        level: list[object] = [self]
+        for held in level:  # which grows
+            if isinstance(held, Entry):
+                yield held
+                level.extend(vars(held).values())
+            elif isinstance(held, (list, dict)):
+                inside = held.values() if isinstance(held, dict) else held
+                level.extend(inner for inner in inside if isinstance(inner, Entry))
+
+    def references(self) -> Iterator[tuple[str, int]]:
+        """Yield what this entry refers to: the kind and the number of other entries."""
+        for name, value in vars(self).items():
+            level: list[Any] = [value] if name in REFERENCES else []
+            for held in level:
+                if isinstance(held, int):
+                    yield REFERENCES[name], held
+                elif isinstance(held, (list, dict)):
+                    level.extend(held.values() if isinstance(held, dict) else held)
 
 
 def _extension(*path: str, default: Any = None) -> Any:
@@ -30,25 +61,25 @@ def _extension(*path: str, default: Any = None) -> Any:
     return Field(default=default, validation_alias=AliasPath("extensions", *path))
 
 
-class Asset(_Entry):
+class Asset(Entry):
     version: str
     generator: JsonValue = ""
     extras: JsonValue = None
 
 
-class Buffer(_Entry):
+class Buffer(Entry):
     byteLength: Size
     uri: str | None = None
 
 
-class BufferView(_Entry):
+class BufferView(Entry):
     buffer: Index
     byteLength: Size
     byteOffset: Size = 0
     byteStride: Annotated[int, Field(ge=4, le=252)] | None = None
 
 
-class SparseValues(_Entry):
+class SparseValues(Entry):
     bufferView: Index
     byteOffset: Size = 0
 
@@ -57,7 +88,7 @@ class SparseIndices(SparseValues):
     componentType: Literal[5121, 5123, 5125]
 
 
-class Sparse(_Entry):
+class Sparse(Entry):
     """Values in place of some of an accessor's own."""
 
     count: Size
@@ -65,7 +96,7 @@ class Sparse(_Entry):
     values: SparseValues
 
 
-class Accessor(_Entry):
+class Accessor(Entry):
     componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]
     count: Size
     type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
@@ -84,7 +115,7 @@ class Accessor(_Entry):
         return self.count * _COMPONENTS[self.componentType] * self.width
 
 
-class Primitive(_Entry):
+class Primitive(Entry):
     attributes: dict[str, Index]
     indices: Index | None = None
     material: Index | None = None
@@ -92,14 +123,14 @@ class Primitive(_Entry):
     targets: List[dict[str, Index]] = []  # morph targets: how far each attribute goes where their weight is 1
 
 
-class MeshEntry(_Entry):
+class MeshEntry(Entry):
     primitives: List[Primitive]
     name: str | None = None
     weights: List[float] = []  # of its morph targets, where a node says none of its own
     extras: Unread = None  # `targetNames` in it are what they are called: not of the format, but exporters write them
 
 
-class Node(_Entry):
+class Node(Entry):
     children: List[Index] = []
     mesh: Index | None = None
     camera: Index | None = None
@@ -113,26 +144,26 @@ class Node(_Entry):
     name: str | None = None
 
 
-class Skin(_Entry):
+class Skin(Entry):
     """The nodes that move a mesh, and the accessor of the matrices from the mesh to each of them."""
 
     joints: Annotated[list[Index], FailFast(), Field(min_length=1)]
     inverseBindMatrices: Index | None = None
 
 
-class ChannelTarget(_Entry):
+class ChannelTarget(Entry):
     """What a channel moves; without a node nothing (an extension may know what)."""
 
     path: str
     node: Index | None = None
 
 
-class Channel(_Entry):
-    sampler: Index
+class Channel(Entry):
+    curve: Index = Field(validation_alias="sampler")  # of the samplers of its animation
     target: ChannelTarget
 
 
-class AnimationSampler(_Entry):
+class AnimationSampler(Entry):
     """Accessors of times in seconds and of what holds at them."""
 
     input: Index
@@ -140,42 +171,42 @@ class AnimationSampler(_Entry):
     interpolation: Literal["LINEAR", "STEP", "CUBICSPLINE"] = "LINEAR"
 
 
-class Animation(_Entry):
+class Animation(Entry):
     channels: List[Channel] = []
     samplers: List[AnimationSampler] = []
     name: str | None = None
 
 
-class HumanBone(_Entry):
+class HumanBone(Entry):
     """The node that is a bone of a person, in VRM; its name is here in VRM 0 alone."""
 
     node: Index
     bone: str = ""
 
 
-class SceneEntry(_Entry):
+class SceneEntry(Entry):
     nodes: List[Index] = []
 
 
-class Perspective(_Entry):
+class Perspective(Entry):
     yfov: Annotated[float, Field(gt=0.0, lt=3.1416)]
     aspectRatio: Annotated[float, Field(gt=0.0)] | None = None
 
 
-class CameraEntry(_Entry):
+class CameraEntry(Entry):
     type: Literal["perspective", "orthographic"]
     perspective: Perspective | None = None
     name: str | None = None
 
 
-class Cone(_Entry):
+class Cone(Entry):
     """Of a spot light: angles from its axis in radians, up to which it shines fully and beyond which not at all."""
 
     innerConeAngle: Annotated[float, Field(ge=0.0)] = 0.0
     outerConeAngle: Annotated[float, Field(gt=0.0, lt=1.571)] = math.pi / 4.0
 
 
-class LightEntry(_Entry):
+class LightEntry(Entry):
     """A light of KHR_lights_punctual: `intensity` in candela, of a directional one in lux."""
 
     type: Literal["point", "spot", "directional"]
@@ -190,7 +221,7 @@ Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 Map = Annotated[int, Field(ge=0, lt=256)]
 
 
-class TextureTransform(_Entry):
+class TextureTransform(Entry):
     """KHR_texture_transform: scaled, then turned counter-clockwise in radians, then moved."""
 
     offset: Pair = [0.0, 0.0]
@@ -199,7 +230,7 @@ class TextureTransform(_Entry):
     texCoord: Map | None = None
 
 
-class TextureUse(_Entry):
+class TextureUse(Entry):
     index: Index
     texCoord: Map = 0
     transform: Annotated[TextureTransform, BeforeValidator(lambda given: given or {})] = _extension(
@@ -226,7 +257,7 @@ class NormalUse(TextureUse):
 Factor = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
-class MetallicRoughness(_Entry):
+class MetallicRoughness(Entry):
     baseColorFactor: Factor | None = None
     baseColorTexture: TextureUse | None = None
     metallicFactor: float = 1.0
@@ -234,7 +265,7 @@ class MetallicRoughness(_Entry):
     metallicRoughnessTexture: TextureUse | None = None
 
 
-class SpecularGlossiness(_Entry):
+class SpecularGlossiness(Entry):
     diffuseFactor: Factor | None = None
     diffuseTexture: TextureUse | None = None
     glossinessFactor: float = 1.0
@@ -244,7 +275,7 @@ CUT_OUTS = ("MASK", "BLEND")  # modes in which the alpha of the base colour coun
 CUTOFF = 0.5  # the alpha under which there is nothing, where the file does not say which
 
 
-class MaterialEntry(_Entry):
+class MaterialEntry(Entry):
     pbrMetallicRoughness: MetallicRoughness | None = None
     name: str | None = None
     normalTexture: NormalUse | None = None
@@ -301,14 +332,14 @@ REPEAT, MIRRORED, CLAMPED = 10497, 33648, 33071  # how a texture goes on beyond 
 NEAREST = 9728  # the filter that leaves texels sharp
 
 
-class Sampler(_Entry):
+class Sampler(Entry):
     wrapS: int = REPEAT
     wrapT: int = REPEAT
     magFilter: int | None = None
     minFilter: Unread = None
 
 
-class Texture(_Entry):
+class Texture(Entry):
     source: Index | None = None
     sampler: Index | None = None
     webp: Index | None = _extension("EXT_texture_webp", "source")
@@ -319,13 +350,13 @@ class Texture(_Entry):
         return self.source if self.webp is None else self.webp
 
 
-class Image(_Entry):
+class Image(Entry):
     uri: str | None = None
     bufferView: Index | None = None
     mimeType: str | None = None
 
 
-class Header(_Entry):
+class Header(Entry):
     """What is read of the JSON of a glTF file; field names are the format's (glTF 2.0, section 5)."""
 
     asset: Asset

@@ -5,13 +5,12 @@ What materials look like is said in glTF 2.0, section 3.9; how their textures go
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import BaseModel
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Doubles, Floats, Ints, face_vectors
@@ -100,16 +99,10 @@ PLAIN = frozenset(("name", "weights", "extensions"))
 
 
 def _note_unread(header: Header, notes: Notes) -> None:
-    """Note every key, extras of materials among them, and every attribute that is not read."""
-    level: list[object] = [header]
-    for entry in level:  # which grows
-        if isinstance(entry, list):
-            level.extend(inner for inner in entry if isinstance(inner, BaseModel))
-        elif isinstance(entry, BaseModel):
-            kind = WORDS.get(type(entry).__name__)
-            for key in (entry.model_extra or {}) if kind else ():
-                notes.has(str(kind), key)
-            level.extend(getattr(entry, name) for name in type(entry).model_fields)
+    for entry in header.entries():
+        kind = WORDS.get(type(entry).__name__)
+        for key in (entry.model_extra or {}) if kind else ():
+            notes.has(str(kind), key)
     for kind in set(WORDS.values()):
         for key in PLAIN if "material" in kind or "texture" in kind else {*PLAIN, "extras"}:  # notes of applications
             notes.take(kind, key)
@@ -125,10 +118,10 @@ def _note_unread(header: Header, notes: Notes) -> None:
 def beside(header: Header, file: str) -> list[str]:
     """Return what a file of that name, read as one object, leaves out of its scene: one sentence, or none."""
     lights, cameras = ([getattr(node, kind) is not None for node in header.nodes] for kind in ("lamp", "camera"))
-    what = _counts({"light{s}": lights, "camera{s}": cameras})
+    what = " and ".join(_counts({"light{s}": lights, "camera{s}": cameras}))
     left = f"{'is' if sum(lights + cameras) == 1 else 'are'} left out of the object"
     what_to_do = "name one node as the object, FILE#NODE, to keep the rest around it"
-    return [f"{file}: {' and '.join(what)} {left}; {what_to_do}"] if what else []
+    return [f"{file}: {what} {left}; {what_to_do}"] if what else []
 
 
 def lights_and_cameras(header: Header, file: str) -> list[str]:
@@ -144,17 +137,12 @@ def lights_and_cameras(header: Header, file: str) -> list[str]:
 
 
 def _counts(kinds: Mapping[str, Iterable[bool]]) -> list[str]:
-    """Return how many there are of each kind, but for those of which there are none."""
-    return [counted(count, what) for what, those in kinds.items() if (count := sum(those))]
+    """Return how many there are of each kind, but for those of which there are none; {s} and {es} are for several."""
+    counts = {what: sum(those) for what, those in kinds.items()}
+    ends = {True: {"s": "", "es": ""}, False: {"s": "s", "es": "es"}}
+    return [f"{count} {what.format(**ends[count == 1])}" for what, count in counts.items() if count]
 
 
-def counted(count: int, what: str) -> str:
-    """Return a count of things, whose words have {s} or {es} where several have that."""
-    return f"{count} {what.format(s='' if count == 1 else 's', es='' if count == 1 else 'es')}"
-
-
-Fit = Callable[[Doubles], Doubles]
-"""Takes texture coordinates (V, 2) of the format to those of the pictures that were made."""
 BEYOND = 1e-4  # how far texture coordinates may lie outside of a texture before it matters how that goes on
 SMALL = 256  # texels a side up to which half a texel at an edge is seen
 EDGES = " has textures that do not repeat beyond their edges; where they differ, or reach far, they do here"
@@ -171,10 +159,9 @@ class GltfSurfaces:
     def __post_init__(self) -> None:
         self._pictures = FilePictures(len(self.file.header.materials), self.file.references, self.notes)
 
-    def surface(self, number: int | None, parts: Sequence[ImportedPart]) -> tuple[ImportedSurface, Fit]:
-        """Return the surface of a material (None: the format's default), and how texture coordinates fit its pictures;
-        `parts` are all that have it, with the format's texture coordinates."""
-        uvs = [part.uvs for part in parts if part.uvs is not None]
+    def surface(self, number: int | None, parts: Sequence[ImportedPart]) -> tuple[ImportedSurface, Doubles, Doubles]:
+        """Return the surface of a material (None: the format's default), and by what texture coordinates are scaled,
+        (2,), and shifted then, (2,), to fit its pictures; `parts` are all that have it, with the format's."""
         material = MaterialEntry() if number is None else self.file.header.materials[number]
         entry = material.surface
         scaled = np.array([1.0] * 4 if entry.baseColorFactor is None else entry.baseColorFactor, np.float32).clip(0, 1)
@@ -194,13 +181,7 @@ class GltfSurfaces:
         if alpha:
             cutoff = None if material.alphaMode == "BLEND" else material.alphaCutoff
             kept, texture = with_opacity(kept, scaled[3:], cutoff), with_opacity(texture, scaled[3:], cutoff)
-        roughness, metallic = entry.roughnessFactor, entry.metallicFactor
-        words = "the texture {name} of roughness and metallic {why}; it is left out"
-        packed = self._picture(entry.metallicRoughnessTexture, "numbers", words)
-        if packed is not None:
-            self.notes.say("textures of roughness and metallic are replaced by their means")
-            _, green, blue = self._mean(packed, material, entry.metallicRoughnessTexture, parts).tolist()
-            roughness, metallic = roughness * green, metallic * blue
+        roughness, metallic = self._roughness_and_metallic(material, parts)
         normals = emission = None
         if material.normalTexture is not None and material.reads(material.normalTexture):
             normals = self._picture(material.normalTexture, "numbers", "the normal map {name} {why}; it is left out")
@@ -213,19 +194,24 @@ class GltfSurfaces:
                 emission = limited_radiance(glow, picture, self.notes)
         name = "" if number is None else material.name or f"material {number}"
         surface = ImportedSurface(kept, texture, unit(roughness), unit(metallic), normals, emission, name)
-        return self._fitted(surface, material, uvs)
+        return self._fitted(surface, material, [part.uvs for part in parts if part.uvs is not None])
 
-    def _mean(
-        self, packed: Floats, material: MaterialEntry, use: TextureUse | None, parts: Sequence[ImportedPart]
-    ) -> Floats:
-        """The mean (3,) of a picture over the faces that show it; over all of it where it has other coordinates than
-        those that are read."""
+    def _roughness_and_metallic(self, material: MaterialEntry, parts: Sequence[ImportedPart]) -> tuple[float, float]:
+        """The factors times the mean of their picture over the faces that show it; over all of it where it has other
+        coordinates than those that are read."""
+        entry, use = material.surface, material.surface.metallicRoughnessTexture
+        packed = self._picture(use, "numbers", "the texture {name} of roughness and metallic {why}; it is left out")
+        if packed is None or use is None:
+            return entry.roughnessFactor, entry.metallicFactor
+        self.notes.say("textures of roughness and metallic are replaced by their means")
         mapped = [(part, part.uvs) for part in parts if part.uvs is not None]
-        if use is None or not mapped or not use.looked_up_as(material.layout or TextureUse(index=0)):
-            return np.asarray(packed.mean(axis=(0, 1), dtype=np.float64), np.float32)
-        corners = np.concatenate([uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped])
-        sides = face_vectors(np.concatenate([part.vertices[part.faces] for part, _ in mapped]))
-        return mean_over(packed, corners, np.linalg.norm(sides, axis=1))
+        mean = np.asarray(packed.mean(axis=(0, 1), dtype=np.float64), np.float32)
+        if mapped and use.looked_up_as(material.layout or TextureUse(index=0)):
+            corners = np.concatenate([uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped])
+            sides = face_vectors(np.concatenate([part.vertices[part.faces] for part, _ in mapped]))
+            mean = mean_over(packed, corners, np.linalg.norm(sides, axis=1))
+        _, green, blue = mean.tolist()
+        return entry.roughnessFactor * green, entry.metallicFactor * blue
 
     def _picture(self, use: TextureUse | None, kind: Kind, words: str) -> Floats | None:
         """Return the values of a texture, each texel as often as its filter asks for; say why it cannot be had."""
@@ -259,14 +245,11 @@ class GltfSurfaces:
 
     def _fitted(
         self, surface: ImportedSurface, material: MaterialEntry, uvs: Sequence[Doubles]
-    ) -> tuple[ImportedSurface, Fit]:
-        """Give the pictures of a surface what lies beyond their edges, where they do not repeat there."""
-        places = np.concatenate([*uvs, np.zeros((0, 2))])
-        samplers = [self._sampler(use) for use in material.textures]
-        if not surface.pictures or not len(places) or not np.isfinite(places).all():
-            return surface, lambda given: given
-        scale, shift = np.ones(2), np.zeros(2)
-        pictures, changed = list(surface.pictures), False
+    ) -> tuple[ImportedSurface, Doubles, Doubles]:
+        places, scale, shift = np.concatenate([*uvs, np.zeros((0, 2))]), np.ones(2), np.zeros(2)
+        samplers, pictures = [self._sampler(use) for use in material.textures], list(surface.pictures)
+        if not pictures or not len(places) or not np.isfinite(places).all():
+            return surface, scale, shift
         for axis, wraps in enumerate(([use.wrapS for use in samplers], [use.wrapT for use in samplers])):
             low, high = float(places[:, axis].min()), float(places[:, axis].max())
             side = 1 - axis  # rows of pictures come first
@@ -280,7 +263,7 @@ class GltfSurfaces:
                 self.notes.say(EDGES)
             if wraps[0] == gltf_entries.MIRRORED and out:
                 pictures = [np.concatenate([picture, np.flip(picture, side)], axis=side) for picture in pictures]
-                scale[axis], changed = 0.5, True
+                scale[axis] = 0.5
             elif wraps[0] in (gltf_entries.CLAMPED, gltf_entries.MIRRORED) and (out or any(differ)):
                 unit_size = int(np.gcd.reduce(sizes))  # pads are whole texels of each
                 before, after = (max(0, int(np.ceil(beyond * unit_size))) + 1 for beyond in (-low, high - 1.0))
@@ -292,10 +275,8 @@ class GltfSurfaces:
                     step = size // unit_size
                     texels = np.clip(np.arange(-before * step, (unit_size + after) * step), 0, size - 1)
                     pictures[number] = np.take(pictures[number], texels, side)
-                scale[axis], shift[axis], changed = unit_size / total, before / total, True
-        if not changed:
-            return surface, lambda given: given
-        return surface.with_pictures(pictures), lambda given: given * scale + shift
+                scale[axis], shift[axis] = unit_size / total, before / total
+        return surface.with_pictures(pictures), scale, shift
 
 
 # --- primitives in their places --------------------------------------------------------------------------------------
@@ -310,12 +291,8 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Parse a glTF file; arguments, results and errors as for the others (`advsearch.scene.importing.objects`)."""
     file = GltfFile(path, data)
     header = file.header
-    drawn = [
-        (node, mesh, pose)
-        for node, pose in gltf_skeleton.poses(header)
-        if (mesh := header.nodes[node].mesh) is not None
-    ]
-    drawn.sort(key=lambda item: item[0])
+    poses = sorted(gltf_skeleton.poses(header), key=lambda item: item[0])
+    drawn = [(node, mesh, pose) for node, pose in poses if (mesh := header.nodes[node].mesh) is not None]
     moving = gltf_skeleton.check_moving(file, [node for node, _, _ in drawn])
     skinned = {mesh for node, mesh, _ in drawn if header.nodes[node].skin is not None}
     pieces = {
@@ -330,20 +307,18 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     left_out(header, notes)
     if len(with_faces) < len(pieces):
         notes.say(f"{len(pieces) - len(with_faces)} parts without faces (points, lines) are left out")
-    for words, meshes in (
-        (SEE_THROUGH, {mesh for (mesh, _), piece in with_faces.items() if piece.see_through}),
-        (DEFAULT, {mesh for (mesh, _), piece in with_faces.items() if piece.material is None}),
-    ):
-        if meshes:
-            notes.say(counted(len(meshes), words))
+    clear = {mesh for (mesh, _), piece in with_faces.items() if piece.see_through}
+    bare = {mesh for (mesh, _), piece in with_faces.items() if piece.material is None}
+    for sentence in _counts({SEE_THROUGH: [True] * len(clear), DEFAULT: [True] * len(bare)}):
+        notes.say(sentence)
     surfaces, finished = GltfSurfaces(file, notes), dict[tuple[int, int], ImportedPart]()
     groups = dict[int | None, dict[tuple[int, int], ImportedPart]]()
     for key, piece in with_faces.items():
         groups.setdefault(piece.material, {})[key] = piece.part
     for material, group in groups.items():
-        surface, fit = surfaces.surface(material, list(group.values()))
+        surface, scale, shift = surfaces.surface(material, list(group.values()))
         for key, part in group.items():
-            uvs = None if part.uvs is None else fit(part.uvs) * [1.0, -1.0] + [0.0, 1.0]
+            uvs = None if part.uvs is None else (part.uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
             finished[key] = replace(part, surface=surface, uvs=uvs)
     everywhere = dict(gltf_skeleton.poses(header.model_copy(update={"scenes": []})))
     skins = {}

@@ -193,7 +193,7 @@ def skeleton_of(file: GltfFile, drawn: Mapping[int, int]) -> Skeleton | None:
 
     wanted = [(animation, list(filter(counts, animation.channels))) for animation in header.animations]
     keys = [
-        header.accessors[animation.samplers[channel.sampler].output]
+        header.accessors[animation.samplers[channel.curve].output]
         for animation, channels in wanted
         for channel in channels
     ]
@@ -222,7 +222,7 @@ def skeleton_of(file: GltfFile, drawn: Mapping[int, int]) -> Skeleton | None:
 
 def _track(file: GltfFile, animation: Animation, channel: Channel, drawn: Mapping[int, int]) -> Track:
     path, accessors = file.path, file.header.accessors
-    sampler, node, what = animation.samplers[channel.sampler], channel.target.node or 0, channel.target.path
+    sampler, node, what = animation.samplers[channel.curve], channel.target.node or 0, channel.target.path
     entry, output = accessors[sampler.input], accessors[sampler.output]
     if entry.type != "SCALAR" or entry.componentType != 5126 or not entry.count:
         raise damaged(path, "keys of a clip at times in seconds, of type SCALAR and 32-bit floats", "others")

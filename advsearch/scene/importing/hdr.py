@@ -91,7 +91,6 @@ def read_exr(file: Path, data: bytes) -> tuple[Planes, list[str]]:
 
 
 def _check_size(file: Path, picture: Any) -> None:
-    """Refuse a picture, opened without its pixels, that takes too much memory or has other than plain pixels."""
     values = 0
     for part in picture.parts:
         header = part.header
@@ -104,16 +103,14 @@ def _check_size(file: Path, picture: Any) -> None:
 
 
 def _window(header: Mapping[str, Any], name: str) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the first row and column of a window, and its height and width."""
     low, high = (np.asarray(corner, dtype=np.int64) for corner in header[name])
-    width, height = (int(extent) for extent in high - low + 1)
-    return (int(low[1]), int(low[0])), (height, width)
+    width, height = map(int, high - low + 1)
+    return (int(low[1]), int(low[0])), (height, width)  # its first row and column, and its size
 
 
 def _chosen(
     file: Path, parts: list[tuple[dict[str, Any], dict[str, Any]]]
 ) -> tuple[dict[str, Any], dict[str, Any], list[str]]:
-    """Return the header and the channels of the layer that is the picture, and clauses about other ones."""
     layers: list[tuple[str, dict[str, Any], dict[str, Any]]] = []
     for header, channels in parts:
         by_layer: dict[str, dict[str, Any]] = {}
@@ -143,29 +140,24 @@ def _chosen(
 
 def _colored(planes: Mapping[str, Plane], size: tuple[int, ...]) -> dict[str, Plane]:
     """Return red, green and blue from luminance, and where there is one, chroma: RY = (R - Y) / Y, and so BY."""
-    luminance = planes["Y"]
     if "RY" not in planes:
-        return dict.fromkeys("RGB", luminance)
-    y = luminance.astype(np.float32)
-    red, blue = ((_enlarged(planes[key], size) + 1.0) * y for key in ("RY", "BY"))
+        return dict.fromkeys("RGB", planes["Y"])
+    y, chroma = planes["Y"].astype(np.float32), []
+    for plane in (planes["RY"].astype(np.float32), planes["BY"].astype(np.float32)):
+        for axis in (0, 1):  # it has a value at every n-th row and column only
+            last = plane.shape[axis] - 1
+            at = np.minimum(np.arange(size[axis]) / round(size[axis] / (last + 1)), last)
+            low = at.astype(np.int64)
+            share = np.expand_dims((at - low).astype(np.float32), 1 - axis)
+            plane = plane.take(low, axis) * (1.0 - share) + plane.take(np.minimum(low + 1, last), axis) * share
+        chroma.append((plane + 1.0) * y)
+    red, blue = chroma
     green = (y - LUMINANCE[0] * red - LUMINANCE[2] * blue) / LUMINANCE[1]
-    return {key: np.maximum(plane, 0.0).astype(np.float32) for key, plane in (("R", red), ("G", green), ("B", blue))}
-
-
-def _enlarged(plane: Plane, size: tuple[int, ...]) -> Plane:
-    """Interpolate a channel that has a value at every n-th row and column only."""
-    plane = plane.astype(np.float32)
-    for axis in (0, 1):
-        last = plane.shape[axis] - 1
-        at = np.minimum(np.arange(size[axis]) / round(size[axis] / (last + 1)), last)
-        low = at.astype(np.int64)
-        share = np.expand_dims((at - low).astype(np.float32), 1 - axis)
-        plane = plane.take(low, axis) * (1.0 - share) + plane.take(np.minimum(low + 1, last), axis) * share
-    return plane
+    colors = {"R": red, "G": green, "B": blue}
+    return {key: np.maximum(plane, 0.0).astype(np.float32) for key, plane in colors.items()}
 
 
 def _displayed(header: Mapping[str, Any], planes: Planes, notes: list[str]) -> Planes:
-    """Return what the display window shows of the data window."""
     (top, left), size = _window(header, "dataWindow")
     (high, near), (height, width) = _window(header, "displayWindow")
     if (top, left) == (high, near) and size == (height, width):
@@ -192,13 +184,10 @@ _NUMBER = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
 def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Floats, list[str]]:
-    """Unpack a Radiance RGBE picture; `linear` makes floats of it, which take three times the memory. Raises
-    FileFormatError: not a Radiance picture, one in XYZ colours, too large, or cut short.
-
-    Returns:
-        (H, W, 4) uint8: three mantissas and an exponent; row 0 is the top, column 0 the left. (3,) float32 by which the
-        linear values are multiplied: the inverse of all COLORCORR lines. And clauses about what is left out.
-    """
+    """Unpack a Radiance RGBE picture: (H, W, 4) uint8, three mantissas and an exponent, row 0 on top, of which `linear`
+    makes floats that take three times the memory; (3,) float32 by which the linear values are multiplied, the inverse
+    of all COLORCORR lines; and clauses about what is left out. Raises FileFormatError: not a Radiance picture, one in
+    XYZ colours, too large, or cut short."""
     end = re.search(rb"\r?\n\r?\n", data)
     if not data.startswith(b"#?") or not end:
         got = looks_like(data) if not data.startswith(b"#?") else "half a header"
@@ -218,13 +207,7 @@ def read_radiance(path: Path, data: bytes) -> tuple[Bytes, Floats, list[str]]:
     # in our order it comes from the top, and from the left
     down, across = (1 if sign + axis in (b"-Y", b"+X") else -1 for sign, axis in (size.group(1, 2), size.group(4, 5)))
     pixels = pixels[::down, ::across]
-    return pixels if size[2] == b"Y" else pixels.transpose(1, 0, 2), *_scale(head)
-
-
-def _scale(head: bytes) -> tuple[Floats, list[str]]:
-    """Return the factors (3,) that undo what a header says the colours were multiplied by, and clauses; but not
-    EXPOSURE lines, as nowhere else: the exposure of pictures is metered."""
-    scale, notes = np.ones(3), list[str]()
+    scale, notes = np.ones(3), list[str]()  # but not EXPOSURE lines, as nowhere else: exposure is metered
     for text in re.findall(rb"^COLORCORR=(.*)$", head, re.MULTILINE)[:100]:
         numbers = np.array(list(map(float, re.findall(_NUMBER, text)[:4])))
         undone = scale / numbers if len(numbers) == 3 and (numbers > 0.0).all() else np.full(3, np.nan)
@@ -232,14 +215,11 @@ def _scale(head: bytes) -> tuple[Floats, list[str]]:
             scale = undone
         else:
             notes.append(f"its line {shown('COLORCORR=' + text.decode('latin-1'))} is left out")
-    return scale.astype(np.float32), notes
+    return pixels if size[2] == b"Y" else pixels.transpose(1, 0, 2), scale.astype(np.float32), notes
 
 
 def linear(pixels: Bytes) -> Floats:
-    """Return the linear values (H, W, 3) float32, at least 0, of pixels (H, W, 4).
-
-    A value is mantissa x 2^(exponent - 136), as in Mitsuba.
-    """
+    """Return the linear values (H, W, 3) float32 of pixels (H, W, 4): mantissa x 2^(exponent - 136), as in Mitsuba."""
     scale = np.ldexp(np.float32(1.0), pixels[:, :, 3].astype(np.int32) - 136)
     scale = np.where(pixels[:, :, 3] == 0, np.float32(0.0), scale)
     return np.ascontiguousarray(pixels[:, :, :3].astype(np.float32) * scale[:, :, None], dtype=np.float32)
@@ -249,11 +229,9 @@ def _scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
     result = np.empty((height, width, 4), np.uint8)
     position, mark = 0, bytes([2, 2, width >> 8 & 0xFF, width & 0xFF])
     for row in range(height):
+        encoded = 8 <= width < 32768 and body[position : position + 4] == mark
         try:
-            if 8 <= width < 32768 and body[position : position + 4] == mark:
-                position = _run_lengths(body, position + 4, result[row])
-            else:
-                position = _plain_line(body, position, result[row])
+            position = (_run_lengths if encoded else _plain_line)(body, position + 4 * encoded, result[row])
         except (IndexError, ValueError):
             got = f"{row} whole ones and the start of another; the file is cut short or damaged"
             raise damaged(path, f"{height} scanlines of {width} pixels", got) from None
@@ -262,21 +240,15 @@ def _scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
 
 def _run_lengths(body: bytes, position: int, line: Bytes) -> int:
     """Fill a line (W, 4) from its four run-length encoded channels; return the position after them."""
-    width = len(line)
     for channel in range(4):
         pieces, filled = [], 0
-        while filled < width:
+        while filled < len(line):
             count = body[position]
             if count == 0:
                 raise ValueError("a run of length zero")
-            if count > 128:
-                count -= 128
-                pieces.append(body[position + 1 : position + 2] * count)
-                position += 2
-            else:
-                pieces.append(body[position + 1 : position + 1 + count])
-                position += 1 + count
-            filled += count
+            size, times = (1, count - 128) if count > 128 else (count, 1)
+            pieces.append(body[position + 1 : position + 1 + size] * times)
+            position, filled = position + 1 + size, filled + size * times
         line[:, channel] = np.frombuffer(b"".join(pieces), np.uint8)
     return position
 
@@ -290,8 +262,7 @@ def _plain_line(body: bytes, position: int, line: Bytes) -> int:
         return position + 4 * width
     filled, shift = 0, 0
     while filled < width:
-        pixel = body[position : position + 4]
-        position += 4
+        pixel, position = body[position : position + 4], position + 4
         if pixel[:3] == b"\x01\x01\x01":
             count = pixel[3] << shift
             if filled == 0 or filled + count > width:

@@ -88,11 +88,9 @@ class MtlReader:
         """Return a material by its name, or None; the name may have a comment after it. Of pictures of one UDIM square
         each, it takes those of that one, or as the file names them."""
         material = self._named(name)
-        if material is None:
-            return None
-        if (id(material), square) not in self._painted:
+        if material is not None and (id(material), square) not in self._painted:
             self._painted[id(material), square] = self._look_of(material, square, name)
-        return self._painted[id(material), square]
+        return None if material is None else self._painted[id(material), square]
 
     def squares_of(self, name: str, wanted: Sequence[int]) -> list[int]:
         """Return for which of these UDIM squares, the first of them 1001, there are pictures of their own; none of a
@@ -125,13 +123,22 @@ class MtlReader:
                 what = f"{material.spelled[key]} of the material {shown(material.name)}"
                 self.notes.say(f"{what} lies elsewhere than its other maps (-s, -o); it is left out")
                 del uses[key]
-        rest = material.numbers("kd")
-        color = color_of(rest)
-        if "kd" in material.statements and color is None:
+        rest, base, color = material.numbers("kd"), uses.get("map_kd"), None
+        values = numbers_of(rest)
+        if values is not None and len(values) in (1, 3, 4):  # of four, three count
+            color = np.clip(np.broadcast_to(values[:3], (3,)), 0.0, 1.0).astype(np.float32)
+        elif "kd" in material.statements:
             what = f"the Kd {shown(rest)} of the material {shown(material.name)}"
             self.notes.say(f"{what} is no colour; neutral grey is used instead")
-        texture = self._texture(material, uses.get("map_kd"), color)
-        if "map_kd" in uses and color is not None and (color > 0.999).all():
+        # A texture stands alone: a Kd beside it is an exporter's default more often than a tint.
+        instead = f"{instead_of_texture(color)} is used instead"
+        words = f"{material.file} names the texture {{name}}, which {{why}}; {instead}"
+        texture = self._picture(base, "colours and alpha", words)
+        if base is not None and texture is not None:
+            if texture[:, :, 3].min() < 1.0 and "map_d" not in material.statements:
+                self.notes.say(f"the alpha of {shown(base.name)} is left out: no map_d makes it an opacity")
+            texture = np.ascontiguousarray(texture[:, :, :3])
+        if base is not None and color is not None and (color > 0.999).all():
             color = None  # plain white only leaves a texture alone
         look = replace(
             self._see_through(material, uses.get("map_d"), ImportedSurface(color, texture, name=material.name)),
@@ -184,21 +191,21 @@ class MtlReader:
                 self.notes.has("texture option", f"-{option} of {material.spelled[key]}")
         return use
 
-    def _texture(self, material: MtlMaterial, use: MapUse | None, color: Floats | None) -> Floats | None:
-        """Return the base colour texture. It stands alone: a Kd beside it is an exporter's default more often than a
-        tint."""
-        instead = f"{instead_of_texture(color)} is used instead"
-        words = f"{material.file} names the texture {{name}}, which {{why}}; {instead}"
-        picture = self._picture(use, "colours and alpha", words)
-        if use is None or picture is None:
-            return None
-        if picture[:, :, 3].min() < 1.0 and "map_d" not in material.statements:
-            self.notes.say(f"the alpha of {shown(use.name)} is left out: no map_d makes it an opacity")
-        return np.ascontiguousarray(picture[:, :, :3])
-
     def _see_through(self, material: MtlMaterial, use: MapUse | None, surface: ImportedSurface) -> ImportedSurface:
-        """Give a surface its opacity: ``d``, a number, or ``Tr``, and ``map_d``, a picture."""
-        factor = self._opacity(material)
+        """Give a surface its opacity: ``d``, a number, or 1 - ``Tr``, which some programs write for d; and ``map_d``, a
+        picture."""
+        if "-halo" in material.numbers("d").lower().split():
+            self.notes.has("option", "-halo of d")
+        factor, clear = share_of(material.numbers("d"), -1.0), share_of(material.numbers("tr"), -1.0)
+        what = f"the material {shown(material.name)} has Tr {clear:g}"
+        if factor >= 0.0 and clear >= 0.0 and min(abs(clear - factor), abs(1.0 - clear - factor)) > 0.01:
+            self.notes.say(f"{what} beside d {factor:g}, which it contradicts; d is taken for its opacity")
+        elif factor < 0.0 < clear:
+            self.notes.say(
+                f"{what} and no d: it is taken for transparency, which makes its opacity {1.0 - clear:g}; some programs"
+                f" mean opacity by it, so write d in its place"
+            )
+        factor = factor if factor >= 0.0 else 1.0 - max(clear, 0.0)
         picture = self._picture(use, "colours and alpha", "the opacity {name} {why}; it is opaque instead")
         if picture is None and factor == 1.0:
             return surface
@@ -214,23 +221,6 @@ class MtlReader:
             texture = np.concatenate([texture, fitted[:, :, None]], axis=2)
         return replace(surface, color=with_opacity(color, share, None), texture=with_opacity(texture, share, None))
 
-    def _opacity(self, material: MtlMaterial) -> float:
-        """Return ``d``, or 1 - ``Tr`` where there is none; some programs write Tr for d."""
-        if "-halo" in material.numbers("d").lower().split():
-            self.notes.has("option", "-halo of d")
-        opacity, clear = share_of(material.numbers("d"), -1.0), share_of(material.numbers("tr"), -1.0)
-        what = f"the material {shown(material.name)} has Tr {clear:g}"
-        if opacity >= 0.0:
-            if clear >= 0.0 and min(abs(clear - opacity), abs(1.0 - clear - opacity)) > 0.01:
-                self.notes.say(f"{what} beside d {opacity:g}, which it contradicts; d is taken for its opacity")
-            return opacity
-        if clear > 0.0:
-            self.notes.say(
-                f"{what} and no d: it is taken for transparency, which makes its opacity {1.0 - clear:g}; some programs"
-                f" mean opacity by it, so write d in its place"
-            )
-        return 1.0 - max(clear, 0.0)
-
     def _share(self, material: MtlMaterial, key: str, use: MapUse | None, name: str, square: int) -> float | None:
         """Return a roughness or metallic: the mean of its map over the faces that show it, or else its number; None
         where there is neither."""
@@ -244,7 +234,6 @@ class MtlReader:
         return value if value >= 0.0 else None
 
     def _bumps(self, uses: dict[str, MapUse]) -> Floats | None:
-        """Return the normal map: ``norm``, or ``map_Bump`` or ``bump`` where these hold normals."""
         words = "the normal map {name} {why}; it is left out"
         for key, use in ((key, uses[key]) for key in NORMALS if key in uses):
             picture = self._picture(use, "numbers", words)
@@ -255,18 +244,15 @@ class MtlReader:
         return None
 
     def _glow(self, material: MtlMaterial, use: MapUse | None) -> Floats | None:
-        """Return the radiance that is said by ``Ke`` and ``map_Ke``; where there are both, their product."""
-        rest = material.numbers("ke")
-        factor = radiance_of(rest)
-        if factor is None:
-            self.notes.say(f"the emission {shown(rest)} is no colour; it is left out")
+        values = numbers_of(material.numbers("ke") or "0")
+        if values is None or len(values) not in (1, 3) or min(values) < 0:
+            self.notes.say(f"the emission {shown(material.numbers('ke'))} is no colour; it is left out")
             return None
+        factor = np.broadcast_to(values, (3,))
         picture = self._picture(use, "colours", "the texture {name} of the emission {why}; it is left out")
         if use is not None and picture is None:
             return None
-        if use is not None and not factor.any():
-            factor = np.ones(3)
-        return limited_radiance(factor, picture, self.notes)
+        return limited_radiance(np.ones(3) if use is not None and not factor.any() else factor, picture, self.notes)
 
     @cached_property
     def _pictures(self) -> FilePictures:
@@ -357,19 +343,10 @@ def corner_of(square: int) -> tuple[int, int]:
 Pair = tuple[float, float]
 _MTL_NUMBER = r"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 _OPTIONS = {
-    "blendu": "on|off",
-    "blendv": "on|off",
-    "bm": _MTL_NUMBER,
-    "boost": _MTL_NUMBER,
-    "cc": "on|off",
-    "clamp": "on|off",
-    "colorspace": r"\S+",
-    "imfchan": "[rgbmlz]",
-    "mm": rf"{_MTL_NUMBER}\s+{_MTL_NUMBER}",
-    "o": rf"{_MTL_NUMBER}(?:\s+{_MTL_NUMBER}){{0,2}}",
-    "s": rf"{_MTL_NUMBER}(?:\s+{_MTL_NUMBER}){{0,2}}",
-    "t": rf"{_MTL_NUMBER}(?:\s+{_MTL_NUMBER}){{0,2}}",
-    "texres": r"\d+",
+    **dict.fromkeys(("blendu", "blendv", "cc", "clamp"), "on|off"),
+    **dict.fromkeys(("bm", "boost"), _MTL_NUMBER),
+    **dict.fromkeys(("o", "s", "t"), rf"{_MTL_NUMBER}(?:\s+{_MTL_NUMBER}){{0,2}}"),
+    **{"colorspace": r"\S+", "imfchan": "[rgbmlz]", "mm": rf"{_MTL_NUMBER}\s+{_MTL_NUMBER}", "texres": r"\d+"},
     "type": r"sphere|cube_\w+",
 }
 _OPTION = re.compile(
@@ -445,31 +422,13 @@ def map_of(rest: str) -> MapUse | None:
         options[unknown[1].lower()], name = "", name[unknown.end() :]
     if not name:
         return None
-    usual = {"s": (1.0, 1.0), "o": (0.0, 0.0), "mm": (0.0, 1.0), "bm": (1.0, 1.0)}
-    scale, offset, values, (bump, _) = (_pair(options.get(key, ""), pair) for key, pair in usual.items())
+    pairs = []
+    for key, usual in {"s": (1.0, 1.0), "o": (0.0, 0.0), "mm": (0.0, 1.0), "bm": (1.0, 1.0)}.items():
+        words = options.get(key, "").split()[:2]
+        u, v = (*map(float, words), *usual[len(words) :])
+        pairs.append((u, v) if abs(u) < 1e6 and abs(v) < 1e6 else usual)  # what can be computed with
+    scale, offset, values, (bump, _) = pairs
     return MapUse(name, options, scale, offset, values, bump)
-
-
-def _pair(text: str, otherwise: Pair) -> Pair:
-    """What an option says, or what holds otherwise, where it says too little or nothing that can be computed with."""
-    words = text.split()[:2]
-    u, v = (*map(float, words), *otherwise[len(words) :])
-    return (u, v) if abs(u) < 1e6 and abs(v) < 1e6 else otherwise
-
-
-def color_of(rest: str) -> Floats | None:
-    """Return a colour (3,) float32, clipped to [0, 1], of one number, three, or four of which three count; or None."""
-    values = numbers_of(rest)
-    if values is None or len(values) not in (1, 3, 4):
-        return None
-    color: Floats = np.clip(np.broadcast_to(values[:3], (3,)), 0.0, 1.0).astype(np.float32)
-    return color
-
-
-def radiance_of(rest: str) -> Doubles | None:
-    """Return one or three numbers of at least 0 as a colour (3,), black where there are none; None for other words."""
-    values = numbers_of(rest or "0")
-    return np.broadcast_to(values, (3,)) if values is not None and len(values) in (1, 3) and min(values) >= 0 else None
 
 
 def numbers_of(rest: str) -> list[float] | None:

@@ -58,12 +58,14 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read an STL file as one part; its facet normals are made anew, as every program does. Raises FileFormatError: it
     is damaged, or has no facets."""
     promised = 84 + 50 * struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 84
-    colors = None
+    corners, surface = None, ImportedSurface()
     if len(data) == promised:
         check_faces(path, (promised - 84) // 50)
         facets = np.frombuffer(data, _FACET, offset=84)
         points = facets["vertices"].astype(np.float64).reshape(-1, 3)
         colors = _colors(data[:80], facets["attribute"], notes)
+        if colors is not None:
+            corners, surface = np.repeat(colors[:, None], 3, axis=1), ImportedSurface(color=np.ones(3, np.float32))
     elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
         points = _of_text(path, data, notes)
     else:
@@ -72,14 +74,10 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         raise damaged(path, f"an STL file (in binary, {promised} bytes for its number of facets)", got)
     if not len(points):
         raise FileFormatError(f"{path}: expected a mesh with faces, got none; export triangles")
-    faces = np.arange(len(points)).reshape(-1, 3)
-    surface = ImportedSurface() if colors is None else ImportedSurface(color=np.ones(3, np.float32))
-    corners = None if colors is None else np.repeat(colors[:, None], 3, axis=1)
-    return [ImportedPart(points, faces, None, None, corners, surface)]
+    return [ImportedPart(points, np.arange(len(points)).reshape(-1, 3), None, None, corners, surface)]
 
 
 def _of_text(path: Path, data: bytes, notes: Notes) -> Doubles:
-    """Return the corners (3 F, 3) of the facets of an ASCII file."""
     if not re.search(rb"\bend\s?solid", data, re.IGNORECASE):
         raise damaged(path, "an ASCII STL file that ends in 'endsolid'", "one that is cut short")
     data = _NAMED.sub(b"", data.replace(b"\r", b"\n"))
@@ -98,28 +96,25 @@ def _of_text(path: Path, data: bytes, notes: Notes) -> Doubles:
 
 
 def _colors(head: bytes, attributes: Attributes, notes: Notes) -> Doubles | None:
-    """Return the linear colours (F, 3) of facets, or None.
-
-    Two programs have their own ways, with 5 bits a channel. Magics writes ``COLOR=`` and four bytes, the colour of all,
-    into the header, and red in the lowest bits of a facet whose highest bit is not set. VisCAM has blue in the lowest
-    bits, and sets the highest where a facet has a colour.
-    """
+    # Two programs have their own ways, with 5 bits a channel. Magics writes ``COLOR=`` and four bytes, the colour of
+    # all, into the header, and red in the lowest bits of a facet whose highest bit is not set. VisCAM has blue in the
+    # lowest bits, and sets the highest where a facet has a colour.
     magics = head.find(b"COLOR=")
     bits = np.stack([(attributes >> shift) & 31 for shift in (10, 5, 0)], axis=1).astype(np.float32) / np.float32(31.0)
     if 0 <= magics <= 70:
         if b"MATERIAL=" in head:
             notes.has("header entry", "MATERIAL")
-        own = (attributes & _OWN == 0) & bool(attributes.any())
+        colored = (attributes & _OWN == 0) & bool(attributes.any())
         bits, plain = bits[:, ::-1], np.frombuffer(head, np.uint8, 3, magics + 6) / np.float32(255.0)
         if head[magics + 9] < 255 and head[magics + 9] > 0:
             notes.has("opacity of its header entry", "COLOR")
     else:
-        own, plain = attributes & _OWN != 0, np.full(3, NEUTRAL, np.float32)
-        if not own.any():
+        colored, plain = attributes & _OWN != 0, np.full(3, NEUTRAL, np.float32)
+        if not colored.any():
             if attributes.any():
                 notes.has("attribute bytes of its facets, which are no colours known here,", f"{attributes.max():#06x}")
             return None
-    display = np.where(own[:, None], bits, plain).astype(np.float32)
+    display = np.where(colored[:, None], bits, plain).astype(np.float32)
     return np.asarray(srgb_to_linear(display), dtype=np.float64)
 
 
@@ -175,13 +170,11 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     """Return the object of that name which some parts of a file, at least one, make up; `notes` are warnings about them
     so far, and `up` as in `import_object`. Raises InputError: the geometry has NaN, infinite, or coincident vertices
     only."""
-    seen = visible(parts)
+    seen, more, gltf_file = visible(parts), Notes(file.name), file.suffix.lower() in GLTF
     clear = ", ".join(dict.fromkeys(shown(part.surface.name or "a part") for part in parts if part not in seen))
-    more = Notes(file.name)
     if clear:
         more.say(f"all light passes through {clear} (opacity 0): left out; give it an opacity to see it")
-    parts, gltf_file = seen, file.suffix.lower() in GLTF
-    known = up or ("y" if gltf_file else None)
+    parts, known = seen, up or ("y" if gltf_file else None)
     soup = join(parts, str(file), y_up=known == "y")
     axis = guess_up(soup.points[np.unique(soup.faces)], file.name) if known is None else UpAxis(known)
     if known is None and axis.axis == "y":
@@ -192,7 +185,14 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     if opacity is not None and not opacity.any():
         opacity = None
         more.say("it is transparent all over; it is shown opaque")
-    material = _material(soup, surfaces, more)
+    area = np.bincount(soup.part, weights=np.linalg.norm(soup.face_vectors(), axis=1), minlength=len(surfaces))
+    looks = [Material().with_values(vars(surface), "") for surface in surfaces]
+    values = np.array([[look.roughness, look.metallic] for look in looks])
+    roughness, metallic = map(float, values[area > 0][0])
+    if not (values[area > 0] == values[area > 0][0]).all():
+        roughness, metallic = map(float, (values * area[:, None]).sum(axis=0) / area.sum())
+        means = f"{roughness:.2g} and {metallic:.2g}"
+        more.say(f"the roughness and metallic of its materials are replaced by their means ({means})")
     warnings = [*notes, *more]
     if (rest := len(warnings) - MOST_WARNINGS) > 0:
         warnings = [*warnings[:MOST_WARNINGS], f"{file.name}: {rest:,} more warnings are left out"]
@@ -201,7 +201,7 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
         name=name,
         mesh=_mesh(soup, surfaces, file, parts, UPRIGHT if axis.axis == "y" else np.eye(3)),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
-        material=material,
+        material=Material(roughness=roughness, metallic=metallic),
         source=str(file),
         warnings=tuple(warnings),
         up=axis,
@@ -231,7 +231,6 @@ def _mesh(soup: Soup, surfaces: list[ImportedSurface], file: Path, parts: list[I
 
 
 def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
-    """Return the radiance (H, W, 3) of what is not cut out; None where it is dark."""
     if emission is None or opacity is None:
         return emission
     (rows, columns), (height, width) = emission.shape[:2], opacity.shape
@@ -240,19 +239,6 @@ def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
     enlarged = emission[np.arange(height) * rows // height][:, np.arange(width) * columns // width]
     radiance = np.asarray(enlarged * share, np.float32)
     return radiance if radiance.any() else None
-
-
-def _material(soup: Soup, surfaces: list[ImportedSurface], notes: Notes) -> Material:
-    """Return the mean of the parts' roughness and metallic, weighted by area, and note where they differ."""
-    area = np.bincount(soup.part, weights=np.linalg.norm(soup.face_vectors(), axis=1), minlength=len(surfaces))
-    looks = [Material().with_values(vars(surface), "") for surface in surfaces]
-    values = np.array([[look.roughness, look.metallic] for look in looks])
-    roughness, metallic = values[area > 0][0]
-    if not (values[area > 0] == values[area > 0][0]).all():
-        roughness, metallic = (values * area[:, None]).sum(axis=0) / area.sum()
-        means = f"{roughness:.2g} and {metallic:.2g}"
-        notes.say(f"the roughness and metallic of its materials are replaced by their means ({means})")
-    return Material(roughness=float(roughness), metallic=float(metallic))
 
 
 TOUCHING = 0.02
@@ -269,11 +255,10 @@ def guess_up(points: Doubles, name: str) -> UpAxis:
     """
     shares = {"y": touching_share(points[:, [2, 0, 1]]), "z": touching_share(points)}
     axis, other = ("y", "z") if shares["y"] > CLEAR * shares["z"] else ("z", "y")
+    why = "its shape does not tell, as it rests as well either way"
     if shares[axis] > CLEAR * shares[other]:
-        on = (f"{100 * shares[way]:.0f} %" for way in (axis, other))
-        why = "it then rests on {} of what it covers, seen from above, and on {} otherwise".format(*on)
-    else:
-        why = "its shape does not tell, as it rests as well either way"
+        on, otherwise = (f"{100 * shares[way]:.0f} %" for way in (axis, other))
+        why = f"it then rests on {on} of what it covers, seen from above, and on {otherwise} otherwise"
     return UpAxis(axis, f"{name}: {axis} is taken for up, because {why}; if it lies on its side, give `up={other}`")
 
 
@@ -287,7 +272,6 @@ def touching_share(points: Doubles) -> float:
 
 
 def _hull_area(points: Doubles) -> float:
-    """Area of the convex hull of (N, 2) points; 0 where they lie on a line."""
     if len(points) < 3:
         return 0.0
     try:

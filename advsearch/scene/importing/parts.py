@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -186,20 +187,15 @@ def put(part: ImportedPart, vertices: Doubles, normals: Doubles | None, *, mirro
     return replace(part, faces=part.faces[:, ::-1], normals=None if normals is None else -normals, colors=colors)
 
 
-@dataclass(frozen=True, eq=False)
-class Looked:
+class Looked(NamedTuple):
     """Values that the corners of triangles look up."""
 
     values: Doubles  # (N, C) float64
     index: Ints  # (F, 3) int64 rows of `values`; -1 where a corner has none
 
-    def at(self, chosen: Ints) -> Looked | None:
-        """Return the values of some triangles (f,); None where these have none at all."""
-        index = self.index[chosen]
-        return Looked(self.values, index) if (index >= 0).any() else None
-
 
 def split_at_corners(
+    chosen: Ints,
     points: Looked,
     normals: Looked | None,
     uvs: Looked | None,
@@ -208,23 +204,24 @@ def split_at_corners(
     *,
     flat: bool = False,
 ) -> ImportedPart:
-    """Return a part in which corners with the same point (N, 3), normal (N, 3) and texture coordinate (N, 2) are one
-    vertex; every corner has a point. The rest is as in `ImportedPart`."""
-    looked_up = [values for values in (points, normals, uvs) if values is not None]
-    key, most = np.zeros(points.index.size, dtype=np.int64), 1
-    for corners in looked_up:
-        if most * (len(corners.values) + 1) >= 2**63:  # numbered anew, so that it does not overflow
+    """Return a part of chosen triangles in which corners with the same point (N, 3), normal (N, 3) and texture
+    coordinate (N, 2) are one vertex; every corner has a point. The rest is as in `ImportedPart`, of all triangles."""
+    key, most = np.zeros(3 * len(chosen), dtype=np.int64), 1
+    for looked_up in filter(None, (points, normals, uvs)):
+        count = len(looked_up.values) + 1
+        if most * count >= 2**63:  # numbered anew, so that it does not overflow
             key = np.unique(key, return_inverse=True)[1].reshape(-1)
             most = len(key)
-        key = key * (len(corners.values) + 1) + corners.index.reshape(-1) + 1
-        most *= len(corners.values) + 1
+        key = key * count + looked_up.index[chosen].reshape(-1) + 1
+        most *= count
     _, first, faces = np.unique(key, return_index=True, return_inverse=True)
 
-    def rows(corners: Looked | None) -> Doubles | None:
-        if corners is None:
+    def rows(looked_up: Looked | None) -> Doubles | None:
+        index = np.full(1, -1) if looked_up is None else looked_up.index[chosen].reshape(-1)[first]
+        if looked_up is None or (index < 0).all():
             return None
-        index = corners.index.reshape(-1)[first]
-        return np.where(index[:, None] >= 0, corners.values[index], np.nan)
+        return np.where(index[:, None] >= 0, looked_up.values[index], np.nan)
 
-    vertices = points.values[points.index.reshape(-1)[first]]
-    return ImportedPart(vertices, faces.reshape(-1, 3), rows(normals), rows(uvs), colors, surface, flat=flat)
+    vertices = points.values[points.index[chosen].reshape(-1)[first]]
+    tint = None if colors is None else colors[chosen]
+    return ImportedPart(vertices, faces.reshape(-1, 3), rows(normals), rows(uvs), tint, surface, flat=flat)

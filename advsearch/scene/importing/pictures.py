@@ -62,7 +62,6 @@ def display_image(
             return np.asarray(display[steps_of(image, alpha=alpha)])
         target = max(1, round(height * scale)), max(1, round(width * scale))
         linear = display if raw else srgb_to_linear(display)
-
         weighted = not raw and (alpha or image.has_transparency_data)
 
         def band(top: int, end: int) -> Floats:
@@ -100,7 +99,6 @@ def area_average(image: Floats, height: int, width: int) -> Floats:
 
 
 def _averaged(image: Floats, down: sparse.csr_array, across: sparse.csr_array) -> Floats:
-    """Average rows, then columns, by matrices as `_overlaps` makes them."""
     rows, columns, channels = image.shape
     height, width = down.shape[0], across.shape[0]
     low = down @ image.reshape(rows, columns * channels)
@@ -164,10 +162,10 @@ class FilePictures:
         if (key, kind) not in self._known:
             self._known[key, kind] = self._decoded(content, kind, name)
         values = self._known[key, kind]
-        if isinstance(values, str):
-            self.lacks(name, values, words)
-            return None
-        return values
+        if not isinstance(values, str):
+            return values
+        self.lacks(name, values, words)
+        return None
 
     def lacks(self, name: str, why: str, words: str) -> None:
         """Note that a picture cannot be had, and what takes its place."""

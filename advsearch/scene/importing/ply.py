@@ -92,115 +92,67 @@ def read_elements(path: Path, data: bytes) -> tuple[dict[str, Element], list[str
     if order is None:
         raise damaged(path, f"a PLY header with a format of {', '.join(_FORMATS)}", "none of these")
     check_faces(path, elements["face"].count if "face" in elements else 0)
-    cells, at = (_Bytes if order else _Words)(data[end.end() :]), 0
+    body, at = data[end.end() :], 0
+    cells = np.frombuffer(body, np.uint8) if order else numbers_in(body, np.float64).view(np.uint8)
     for element in elements.values():
-        at = _fill(path, element, cells, at)
+        at = _fill(path, element, cells, at, b"" if order else body)
     return elements, comments
 
 
-class _Words:
-    """The numbers of a text, one a cell."""
+def _fill(path: Path, element: Element, cells: npt.NDArray[np.uint8], at: int, text: bytes) -> int:
+    """Read the rows of an element that begin at a byte; return the byte after them. The bytes of a file in ASCII, whose
+    `text` is given, are those of its numbers, float64 each."""
 
-    def __init__(self, data: bytes) -> None:
-        self.values, self.data = numbers_in(data, np.float64), data
-        self.end = len(self.values)
+    def from_any_byte(kind: np.dtype[np.generic]) -> Numbers:
+        kind = np.dtype(np.float64) if text else kind
+        return np.ndarray((max(0, len(cells) - kind.itemsize + 1),), kind, cells, 0, (1,))
 
-    def width(self, kind: np.dtype[np.generic]) -> int:
-        return 1
+    values = {name: from_any_byte(kind) for name, kind in element.types.items()}
+    counts = {name: from_any_byte(kind) for name, kind in element.lists.items()}
+    widths = {name: counts.get(name, numbers).itemsize for name, numbers in values.items()}
+    most = len(cells) // (8 if text else 1)  # values of a list
 
-    def taken(self, places: Ints, kind: np.dtype[np.generic]) -> Numbers:
-        return self.values[places]
+    def check(after: int) -> None:
+        if after > len(cells):
+            odd = next((word for word in map(text_of, text.split()) if not is_number(word)), None)
+            got = "fewer; the file is cut short" if odd is None else f"{shown(odd)} among their numbers"
+            raise damaged(path, f"{element.count:,} rows of {shown(element.name)}, as the PLY header says", got)
 
-    def number(self, place: int, kind: np.dtype[np.generic]) -> float:
-        return float(self.values.item(place))
+    def rows(count: int) -> tuple[dict[str, Ints], int]:
+        """Go through rows one by one; return the bytes at which each property begins, and the byte after them."""
+        places, place = {name: list[int]() for name in widths}, at
+        steps = [(places[name].append, widths[name], counts.get(name), values[name].itemsize) for name in widths]
+        for _ in range(count):
+            for note, width, counted, size in steps:
+                note(place)
+                check(place + width)
+                if counted is not None:
+                    number = counted.item(place)
+                    if not 0 <= number <= most:
+                        what = f"lists in the PLY element {shown(element.name)}"
+                        raise damaged(path, what, f"one of {number:g} values")
+                    place += size * int(number)
+                place += width
+        check(place)
+        return {name: np.array(begins, dtype=np.int64) for name, begins in places.items()}, place
 
-    def missing(self) -> str:
-        """What there is in the place of numbers: a word that is none, or nothing."""
-        odd = next((word for word in map(text_of, self.data.split()) if not is_number(word)), None)
-        return CUT if odd is None else f"{shown(odd)} among their numbers"
-
-
-class _Bytes:
-    """The bytes of a binary file, one a cell."""
-
-    def __init__(self, data: bytes) -> None:
-        self.values, self.end, self.data = np.frombuffer(data, np.uint8), len(data), data
-
-    def width(self, kind: np.dtype[np.generic]) -> int:
-        return kind.itemsize
-
-    def taken(self, places: Ints, kind: np.dtype[np.generic]) -> Numbers:
-        found: Numbers = self.values[places[:, None] + np.arange(kind.itemsize)].reshape(-1).view(kind)
-        return found
-
-    def number(self, place: int, kind: np.dtype[np.generic]) -> float:
-        if kind.kind == "f":
-            return float(np.frombuffer(self.data, kind, 1, place)[0])
-        part, signed = self.data[place : place + kind.itemsize], kind.kind == "i"
-        return int.from_bytes(part, "big" if kind.str[0] == ">" else "little", signed=signed)
-
-    def missing(self) -> str:
-        return CUT
-
-
-def _fill(path: Path, element: Element, cells: _Words | _Bytes, at: int) -> int:
-    """Read the rows of an element that begin at a cell; return the cell after them."""
-    widths = {name: cells.width(element.lists.get(name, kind)) for name, kind in element.types.items()}
     if not element.count or not widths:
         return at
-    if element.count * sum(widths.values()) > cells.end - at:
-        raise _cut(path, element, cells)
-    places, after = _rows(path, element, cells, at, widths, 1)
-    last = at + (after - at) * element.count
-    steps = (after - at) * np.arange(element.count if last <= cells.end else 0)
-    even = {name: first + steps for name, first in places.items()}
-    counts = [cells.taken(even[name], kind) for name, kind in element.lists.items()]
-    if last <= cells.end and all((sizes == sizes[0]).all() for sizes in counts):
-        places, at = even, last
-    else:  # the lists differ in length
-        places, at = _rows(path, element, cells, at, widths, element.count)
-    for name, kind in element.types.items():
-        if name not in element.lists:
-            element.scalars[name] = cells.taken(places[name], kind)
+    check(at + element.count * sum(widths.values()))
+    places, after = rows(1)
+    end, steps = at + (after - at) * element.count, (after - at) * np.arange(element.count)
+    places = {name: first + steps for name, first in places.items()}
+    if end > len(cells) or any(np.ptp(numbers[places[name]]) != 0 for name, numbers in counts.items()):
+        places, end = rows(element.count)  # the lists differ in length
+    for name, begins in places.items():
+        if name not in counts:
+            element.scalars[name] = values[name][begins]
             continue
-        sizes = cells.taken(places[name], element.lists[name]).astype(np.int64)
-        width = cells.width(kind)
+        sizes = counts[name][begins].astype(np.int64)
         skipped = np.arange(int(sizes.sum())) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-        inside = np.repeat(places[name] + widths[name], sizes) + width * skipped
-        element.listed[name] = Lists(sizes, cells.taken(inside, kind))
-    return at
-
-
-def _rows(
-    path: Path, element: Element, cells: _Words | _Bytes, at: int, widths: dict[str, int], count: int
-) -> tuple[dict[str, Ints], int]:
-    """Go through rows one by one; return the cells at which each property begins, and the cell after them."""
-    places: dict[str, list[int]] = {name: [] for name in widths}
-    steps = [
-        (places[name].append, widths[name], element.lists.get(name), cells.width(kind))
-        for name, kind in element.types.items()
-    ]
-    for _ in range(count):
-        for note, width, counted, size in steps:
-            note(at)
-            if at + width > cells.end:
-                raise _cut(path, element, cells)
-            if counted is not None:
-                number = cells.number(at, counted)
-                if not 0 <= number <= cells.end:
-                    raise damaged(path, f"lists in the PLY element {shown(element.name)}", f"one of {number:g} values")
-                at += size * int(number)
-            at += width
-    if at > cells.end:
-        raise _cut(path, element, cells)
-    return {name: np.array(begins, dtype=np.int64) for name, begins in places.items()}, at
-
-
-CUT = "fewer; the file is cut short"
-
-
-def _cut(path: Path, element: Element, cells: _Words | _Bytes) -> FileFormatError:
-    return damaged(path, f"{element.count:,} rows of {shown(element.name)}, as the PLY header says", cells.missing())
+        inside = np.repeat(begins + widths[name], sizes) + values[name].itemsize * skipped
+        element.listed[name] = Lists(sizes, values[name][inside])
+    return end
 
 
 COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -229,44 +181,39 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     number = reader.texture_numbers(names, corner, counts)[face]
     tint = reader.colors(at, face)
     surfaces = [*reader.textures(names, plain=tint is None), ImportedSurface()]
-    parts = []
-    mapped = np.full((len(at), 3), -1) if uvs is None else uvs.index
+    parts, mapped = [], np.full((len(at), 3), -1) if uvs is None else uvs.index
     for chosen in alike(number, np.asarray((mapped >= 0).all(axis=1))):
-        surface, colors = surfaces[number[chosen[0]]], None if tint is None else tint[chosen]
-        if colors is not None and surface.texture is not None:
-            if colors.min() < 1.0:
+        surface, colors = surfaces[number[chosen[0]]], tint
+        if tint is not None and surface.texture is not None:
+            if tint[chosen].min() < 1.0:
                 notes.say("colours of vertices or faces are left out where there is a texture")
             colors = None
-        if colors is not None:
+        elif tint is not None:
             surface = ImportedSurface(color=np.ones(3, np.float32))
-        part_normals = None if normals is None else Looked(normals, at[chosen])
-        part_uvs = None if uvs is None else uvs.at(chosen)
-        parts.append(split_at_corners(Looked(points, at[chosen]), part_normals, part_uvs, colors, surface))
+        shading = None if normals is None else Looked(normals, at)
+        parts.append(split_at_corners(chosen, Looked(points, at), shading, uvs, colors, surface))
     return parts
 
 
 @dataclass
 class _Properties:
-    """Finds what is known among the properties of a file, and notes what is not."""
-
     path: Path
     elements: dict[str, Element]
     notes: Notes
 
     def __post_init__(self) -> None:
         for element in self.elements.values():
-            if element.name not in ("vertex", "face", "tristrips"):
-                if element.count:
-                    self.notes.has("element", element.name)
-                continue
-            for name in element.types:
-                self.notes.has(f"{element.name} property", name)
+            if element.name in ("vertex", "face", "tristrips"):
+                for name in element.types:
+                    self.notes.has(f"{element.name} property", name)
+            elif element.count:
+                self.notes.has("element", element.name)
 
     def columns(self, element: str, names: Sequence[tuple[str, ...]]) -> Doubles | None:
         """Return the values (N, C) of the first of several groups of properties that an element has; None for none."""
         group = self._known(element, "scalars", *names)
-        scalars = self.elements[element].scalars if group else {}
-        return np.stack([scalars[name].astype(np.float64) for name in group], axis=1) if group else None
+        columns = [self.elements[element].scalars[name].astype(np.float64) for name in group]
+        return np.stack(columns, axis=1) if columns else None
 
     def _list(self, element: str, names: Sequence[str]) -> Lists | None:
         group = self._known(element, "listed", *((name,) for name in names))
@@ -287,21 +234,22 @@ class _Properties:
         table = self.elements.get("face")
         names = CORNERS if table is None else (*CORNERS, *(name for name in table.listed if name not in WEDGES))
         faces, strips = self._list("face", names), self._list("tristrips", CORNERS)
-        corner = [np.zeros(0, np.int64)] if faces is None else [_whole(faces.values)]
-        counts = [np.zeros(0, np.int64)] if faces is None else [faces.counts]
+        corners, counts = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        if faces is not None:
+            corners, counts = _whole(faces.values), faces.counts
         if strips is not None:
-            corner.append(_of_strips(_whole(strips.values), strips.counts).reshape(-1))
-            counts.append(np.full(len(corner[-1]) // 3, 3))
-        all_corners, all_counts = np.concatenate(corner), np.concatenate(counts)
-        if (all_counts < 3).all():
+            triangles = _of_strips(_whole(strips.values), strips.counts)
+            corners = np.concatenate([corners, triangles.reshape(-1)])
+            counts = np.concatenate([counts, np.full(len(triangles), 3)])
+        if (counts < 3).all():
             splats = "f_dc_0" in self.elements["vertex"].scalars  # of 3D Gaussian splatting
             what = f"Gaussian splats, a model that {SPLATS}" if splats else "points or lines only; export triangles"
             raise FileFormatError(f"{self.path}: expected a mesh with faces, got {what}")
-        check_most(self.path, int(all_counts.max()), MOST_CORNERS, "faces with at most {} corners")
-        check_faces(self.path, int((all_counts - 2).clip(0).sum()))
-        if all_corners.min() < 0 or all_corners.max() >= points:
+        check_most(self.path, int(counts.max()), MOST_CORNERS, "faces with at most {} corners")
+        check_faces(self.path, int((counts - 2).clip(0).sum()))
+        if corners.min() < 0 or corners.max() >= points:
             raise damaged(self.path, "faces of its own vertices", "a face that refers to a vertex that is not there")
-        return all_corners, all_counts
+        return corners, counts
 
     def mapped(self, corner: Ints, counts: Ints, triangles: Ints) -> Looked | None:
         """Return the texture coordinates of triangles, kept with the corners of faces, or else with vertices."""
@@ -361,16 +309,13 @@ class _Properties:
             number[: len(numbers)] = numbers
         else:
             number = numbers[corner[np.minimum(np.cumsum(counts) - counts, len(corner) - 1)]]
-        wrong = int(((number < -1) | (number >= len(names))).sum())
-        if wrong:
+        if wrong := int(((number < -1) | (number >= len(names))).sum()):
             self.notes.say(f"{wrong:,} faces have a texnumber of a texture that it does not name; they have none")
         return np.where((number >= 0) & (number < len(names)), number, -1)
 
     def textures(self, names: Sequence[str], *, plain: bool) -> list[ImportedSurface]:
         """Return the surface of each texture; `plain` tells that there are no colours beside them."""
-        references = References(self.path)
-        pictures = FilePictures(len(names), references, self.notes)
-        surfaces = {}
+        pictures, surfaces = FilePictures(len(names), References(self.path), self.notes), {}
         instead = "neutral grey is" if plain else "the colours of its vertices or faces are"
         for name in dict.fromkeys(names):
             words = f" names the texture {{name}}, which {{why}}; {instead} used instead"
@@ -383,7 +328,6 @@ class _Properties:
 
 
 def _whole(values: npt.NDArray[np.generic]) -> Ints:
-    """Return numbers as whole ones; -1 for what is none."""
     if values.dtype.kind == "f":
         values = np.where(np.abs(values.astype(np.float64)) < 2.0**53, values.astype(np.float64), -1.0)
     return values.astype(np.int64)

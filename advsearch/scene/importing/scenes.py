@@ -72,7 +72,14 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     header = gltf.read_header(path, data)
     parts, notes = read_parts(path, data)
     places = dict(poses(header))
-    chosen = header.below([_named(path, header, node, {part.node for part in parts})])
+    labels = {index: header.label(index) for index in sorted(with_above(header.parents, {part.node for part in parts}))}
+    same = [index for index, label in labels.items() if node in (label, f"node {index}")]
+    if not same:
+        raise UnknownNameError(f"node of {path.name}", node, list(dict.fromkeys(labels.values())))
+    if len(same) > 1:
+        numbers = ", ".join(f"{path.name}#node {index}" for index in same[:10])
+        raise InputError(f"{path}: {len(same)} nodes are called {shown(node)}; say which: {numbers}")
+    chosen = header.below(same)
     chosen_parts = [part for part in parts if part.node in chosen]
     others = sorted({part.node for part in parts} - chosen)
     lamps = {index: header.lights[lamp] for index in places if (lamp := header.nodes[index].lamp) is not None}
@@ -90,8 +97,9 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         matrix[:3, :3] *= place.size / frame.size
         matrix[:3, 3] = frame.inside(place.origin)
         surroundings.append(mesh_part(shape.name, shape, matrix, shape.material))
-    glows = any(part.surface.emission is not None for part in parts)
-    unit, why = _unit_of_light(header, bool(lamps) and glows)
+    unit, why = 1.0, ""  # a light of USD emits radiance as its surfaces do
+    if header.asset.generator != GENERATOR:
+        unit, why = _unit_of_light(header, bool(lamps) and any(part.surface.emission is not None for part in parts))
     notes.extend([f"{path.name}: {why}"] if why else [])
     for index, light in lamps.items():
         name = names.free(light.name or header.label(index))
@@ -114,12 +122,10 @@ def node_names(path: Path) -> list[str]:
 
 
 def _mesh_names(header: Header, parts: Sequence[ImportedPart], names: Names) -> dict[int, str]:
-    """Names of the nodes with geometry by number, the same whichever of them is the object."""
     return {number: names.free(header.label(number)) for number in sorted({part.node for part in parts})}
 
 
 def _camera_names(header: Header, nodes: Iterable[int]) -> dict[int, str]:
-    """Names of the cameras with perspective, by the number of their node."""
     names, called = Names(TAKEN), {}
     for index in sorted(nodes):
         camera = header.nodes[index].camera
@@ -200,25 +206,12 @@ def _frame(parts: Sequence[ImportedPart]) -> FileFrame:
     return FileFrame(size, origin)
 
 
-def _named(path: Path, header: Header, name: str, with_mesh: set[int]) -> int:
-    labels = {index: header.label(index) for index in sorted(with_above(header.parents, with_mesh))}
-    found = [index for index, label in labels.items() if name in (label, f"node {index}")]
-    if not found:
-        raise UnknownNameError(f"node of {path.name}", name, list(dict.fromkeys(labels.values())))
-    if len(found) > 1:
-        numbers = ", ".join(f"{path.name}#node {index}" for index in found[:10])
-        raise InputError(f"{path}: {len(found)} nodes are called {shown(name)}; say which: {numbers}")
-    return found[0]
-
-
-def _unit_of_light(header: Header, both: bool) -> tuple[float, str | None]:
+def _unit_of_light(header: Header, both: bool) -> tuple[float, str]:
     """How many candela are one unit of radiance times the file's area, and what is said of it. Alone, lamps are in
     watts, as exporters have them. Beside surfaces that emit light, of which one nit is one unit, what a candela is
     decides how bright they are to each other."""
-    if header.asset.generator == GENERATOR:
-        return 1.0, None  # a light of USD emits radiance as its surfaces do
     if not both:
-        return LUMENS, None
+        return LUMENS, ""
     if "blender" in str(header.asset.generator).lower():
         return LUMENS, (
             "it has lights beside surfaces that emit light, and is Blender's, which exports lights 683 times as bright "
@@ -230,7 +223,6 @@ def _unit_of_light(header: Header, both: bool) -> tuple[float, str | None]:
 def _lamp(
     path: Path, name: str, light: LightEntry, unit: float, pose: Doubles, frame: FileFrame
 ) -> PointLamp | SpotLamp:
-    """A light at its place; light falls off with the square of the distance in object sizes as it does in the file."""
     power = np.array(light.color) * light.intensity / unit
     if light.type == "directional":
         way = UPRIGHT @ pose[:3, 2]  # it shines along its -z
@@ -262,18 +254,16 @@ def _camera(path: Path, name: str, camera: CameraEntry, pose: Doubles, frame: Fi
     ratio = camera.perspective.aspectRatio  # without one, that of the picture holds (section 5.13)
     fov = math.degrees(2.0 * math.atan(math.tan(camera.perspective.yfov / 2.0) * max(ratio or 1.0, 1.0)))
     mirrored = np.linalg.det(axes) < 0.0
-    problem = ""
     if not (np.abs(matrix[:3, 3]) <= FURTHEST).all():  # NaN is not
         problem = f"within {FURTHEST:g} object sizes, got more; correct its place"
     elif not np.allclose(np.linalg.norm(axes, axis=0), 1.0):
         problem = "to look somewhere, got axes without length; correct the scale of its node"
     elif not np.allclose(axes.T @ axes, np.eye(3), atol=SQUARE) or mirrored:
-        problem = (
-            f"under nodes that turn, move and scale it, got {'mirrored' if mirrored else 'sheared'} axes; apply the "
-            "scale of the nodes above it (in Blender Ctrl A)"
-        )
+        got = "mirrored" if mirrored else "sheared"
+        advice = "apply the scale of the nodes above it (in Blender Ctrl A)"
+        problem = f"under nodes that turn, move and scale it, got {got} axes; {advice}"
     elif not 0.0 < fov <= WIDEST_VIEW:
         problem = f"with a field of view up to {WIDEST_VIEW:g} degrees, got {fov:.4g}; correct it"
-    if problem:
-        raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")
-    return PlacedCamera(matrix, fov, upright=ratio is None)
+    else:
+        return PlacedCamera(matrix, fov, upright=ratio is None)
+    raise InputError(f"{path}: expected the camera {name} {problem}, or remove it")

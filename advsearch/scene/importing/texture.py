@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
-from advsearch.scene.assets import Bools, Doubles, Floats, Ints
+from advsearch.scene.assets import Doubles, Floats, Ints, grouped
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import Notes
 from advsearch.scene.importing.geometry import Soup, connected, unit_vectors
@@ -57,14 +57,12 @@ def textured(soup: Soup, surfaces: Sequence[ImportedSurface], notes: Notes) -> t
         return soup, SurfaceMaps(_of_one_color(soup, first), None, first.emission)
     if colored and (first.texture is None or soup.colors.min() == 1.0) and np.isfinite(soup.uvs).all():
         uvs, pictures = _windowed(_into_unit_square(soup), first.pictures, first.texture)
-        twice = _usable(soup, uvs) and _lit_twice(uvs, first, pictures)
-        if _usable(soup, uvs) and not twice:
-            kept_maps = first.with_pictures(pictures)
-            color = _of_one_color(soup, first) if kept_maps.texture is None else kept_maps.texture
-            uvs, maps = np.clip(uvs, 0.0, 1.0), SurfaceMaps(color, kept_maps.normal_map, kept_maps.emission)
-            if maps.normals is not None:
-                uvs, maps = unmirrored(uvs, mirrored(soup, uvs), maps, maps.normals)
-            return replace(soup, uvs=uvs), maps
+        usable = _usable(soup, uvs)
+        twice = usable and _lit_twice(uvs, first, pictures)
+        if usable and not twice:
+            cut = first.with_pictures(pictures)
+            color = _of_one_color(soup, first) if cut.texture is None else cut.texture
+            return _unmirrored(soup, np.clip(uvs, 0.0, 1.0), SurfaceMaps(color, cut.normal_map, cut.emission))
     fresh = unwrapped(soup, material)
     maps = baked(fresh.uvs, soup, surfaces)
     shared = "several faces share a texture that emits light; it was unwrapped anew and its texture resampled"
@@ -82,7 +80,6 @@ def by_material(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[list[s
 
 
 def _overlap(uvs: Doubles, material: Ints) -> bool:
-    """Whether places of different materials (F,) lie at the same texture coordinates (F, 3, 2)."""
     if material.min() == material.max():
         return False
     side = BAKED_SIZE
@@ -110,7 +107,6 @@ def _lit_twice(uvs: Doubles, surface: ImportedSurface, pictures: Sequence[Floats
 
 
 def _in_texels(uvs: Doubles, shape: tuple[int, int]) -> Doubles:
-    """Return texture coordinates (F, 3, 2) as columns and rows of a picture of that height and width."""
     return np.stack([uvs[:, :, 0] * shape[1] - 0.5, (1.0 - uvs[:, :, 1]) * shape[0] - 0.5], axis=2)
 
 
@@ -128,7 +124,6 @@ def _why(soup: Soup, used: Sequence[ImportedSurface], uniform: bool, one_factor:
 
 
 def _plain(surface: ImportedSurface) -> Floats:
-    """Return the base colour of a surface without texture, (3 or 4,) display-referred."""
     return np.full(3, NEUTRAL, dtype=np.float32) if surface.color is None else surface.color
 
 
@@ -143,7 +138,6 @@ def _tinted(color: npt.NDArray[np.floating], factor: npt.NDArray[np.floating]) -
 
 
 def _usable(soup: Soup, uvs: Doubles) -> bool:
-    """Tell whether UVs are known, inside the unit square, not squashed to lines, and use the square."""
     if not np.isfinite(uvs).all() or uvs.min() < -_SLACK or uvs.max() > 1.0 + _SLACK:
         return False
     flat, surface = np.abs(doubled_areas(uvs)) / 2.0, np.linalg.norm(soup.face_vectors(), axis=1)
@@ -197,28 +191,24 @@ def baked(uvs: Doubles, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surf
     bases = [_plain(surface) if surface.texture is None else surface.texture for surface in surfaces]
     through = any(base.shape[-1] == 4 for base in bases)
     image, inside = np.ones((size, size, 3 + through), np.float32), np.zeros((size, size), np.bool_)
-    bumpy, glows = (
-        any(getattr(surface, what) is not None for surface in surfaces) for what in ("normal_map", "emission")
-    )
+    bumpy = any(surface.normal_map is not None for surface in surfaces)
+    glows = any(surface.emission is not None for surface in surfaces)
     normals = np.full((size, size, 3), FLAT) if bumpy else None
     emission = np.zeros((size, size, 3), np.float32) if glows else None
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
-    part = soup.part[face]
-    order = np.argsort(part, kind="stable")
-    for here in np.split(order, np.flatnonzero(np.diff(part[order])) + 1):
+    for surface, here in zip(surfaces, grouped(soup.part[face]), strict=False):
         if not len(here):  # no texel at all
             continue
-        surface, at = surfaces[int(part[here[0]])], np.einsum("tk,tkc->tc", weights[here], soup.uvs[face[here]])
+        y, x, at = rows[here], columns[here], np.einsum("tk,tkc->tc", weights[here], soup.uvs[face[here]])
         color = _looked_up(surface, at, soup, surfaces)
-        image[rows[here], columns[here], : color.shape[1]] = _tinted(color, factor[here])
+        image[y, x, : color.shape[1]] = _tinted(color, factor[here])
         if normals is not None and surface.normal_map is not None and np.isfinite(at).all():
-            bumps = sampled(surface.normal_map, at)
-            normals[rows[here], columns[here]] = turned(bumps, soup, uvs, face[here], weights[here])
+            normals[y, x] = turned(sampled(surface.normal_map, at), soup, uvs, face[here], weights[here])
         if emission is not None and surface.emission is not None and np.isfinite(at).all():
-            emission[rows[here], columns[here]] = sampled(surface.emission, at)
+            emission[y, x] = sampled(surface.emission, at)
     inside[rows, columns] = True
     away, nearest = distance_transform_edt(~inside, return_indices=True)
-    whole = nearest[0], nearest[1]
+    whole = tuple(nearest)
     if emission is not None:
         emission = emission[whole] * (away < _BORDER)[:, :, None]
     return SurfaceMaps(image[whole], None if normals is None else normals[whole], emission)
@@ -280,7 +270,6 @@ def _in_linear(colors: Floats) -> Floats:
 
 
 def _in_display(colors: Floats) -> Floats:
-    """Undo `_in_linear`; what is transparent all over is black."""
     linear, opacity = colors[..., :3], colors[..., 3:]
     if opacity.size:
         linear = linear / np.maximum(opacity, np.float32(1e-9))
@@ -303,32 +292,26 @@ def sampled(texture: Floats, uvs: Doubles) -> Floats:
 FEW = 1e-3  # share of the surface whose texture coordinates may be mirrored without anything being done about it
 
 
-def mirrored(soup: Soup, uvs: Doubles) -> Bools:
-    """Return (F,) which faces have their texture mirrored; where these, or the others, are `FEW`, none or all have."""
-    turned = doubled_areas(uvs) < 0.0
-    area = np.linalg.norm(soup.face_vectors(), axis=1)
-    share = float(area[turned].sum() / area.sum())
-    return np.full(len(turned), share > 0.5) if min(share, 1.0 - share) < FEW else turned
-
-
-def unmirrored(uvs: Doubles, over: Bools, maps: SurfaceMaps, normals: Floats) -> tuple[Doubles, SurfaceMaps]:
-    """Return texture coordinates (F, 3, 2) in [0, 1] that mirror no face, also of those that are over, (F,) as
-    `mirrored` gives them, and the maps for them, which have a normal map; no texel is resampled. The maps get a second
-    half, which is the first one mirrored, and there the faces go."""
-    if not over.any():
-        return uvs, maps
-    if over.all():
+def _unmirrored(soup: Soup, uvs: Doubles, maps: SurfaceMaps) -> tuple[Soup, SurfaceMaps]:
+    """Return a soup whose texture coordinates mirror no face, of such (F, 3, 2) in [0, 1], and the maps for them; no
+    texel is resampled. Where some faces are mirrored, the maps get a second half, which is the first one mirrored, and
+    there these faces go."""
+    soup, normals = replace(soup, uvs=uvs), maps.normals
+    over, area = doubled_areas(uvs) < 0.0, np.linalg.norm(soup.face_vectors(), axis=1)
+    share = float(area[over].sum() / area.sum())
+    if normals is None or share < FEW:
+        return soup, maps
+    if 1.0 - share < FEW:
         turned_over = normals * np.array([1, -1, 1], np.float32) + np.array([0, 1, 0], np.float32)
-        return uvs, replace(maps, normals=turned_over)
-    placed = uvs.copy()
+        return soup, replace(maps, normals=turned_over)
+    placed, color, glow = uvs.copy(), maps.color, maps.emission
     placed[over, :, 0] = 2.0 - placed[over, :, 0]
     placed[:, :, 0] /= 2.0
-    color, glow = maps.color, maps.emission
     other = normals[:, ::-1] * np.array([-1, 1, 1], np.float32) + np.array([1, 0, 0], np.float32)
     if glow is not None and glow.shape != (1, 1, 3):
         glow = np.concatenate([glow, glow[:, ::-1]], axis=1)
     color, normals = np.concatenate([color, color[:, ::-1]], axis=1), np.concatenate([normals, other], axis=1)
-    return placed, SurfaceMaps(color, normals, glow)
+    return replace(soup, uvs=placed), SurfaceMaps(color, normals, glow)
 
 
 def turned(texels: Floats, before: Soup, after: Doubles, face: Ints, weights: Doubles) -> Floats:

@@ -97,45 +97,39 @@ def checked_layers(file: Path) -> list[str]:
         path = waiting.pop()
         if path in known:
             continue
-        known[path] = None
-        size += path.stat().st_size
+        known[path], size = None, size + path.stat().st_size
         most = f"at most {files.scaled(MOST_LAYERS):,} layers"
-        check_most(file.name, len(known), MOST_LAYERS, most, "more, or larger ones")
-        check_most(file.name, size, LARGEST_FILE, most, "more, or larger ones")
+        for count, limit in ((len(known), MOST_LAYERS), (size, LARGEST_FILE)):
+            check_most(file.name, count, limit, most, "more, or larger ones")
         try:
             layer = Sdf.Layer.FindOrOpen(str(path))
         except Exception as error:  # Tf.ErrorException, of which there are many kinds
             raise FileFormatError(f"{path.name}: expected a USD layer, got {_short(error)}") from None
         if layer is None:
             raise FileFormatError(f"{path.name}: expected a USD layer, got none that can be read")
-        for name in layer.GetCompositionAssetDependencies():
-            if name:
-                waiting.append(_inside(folder, path, name, file.name))
-        layer.Traverse(Sdf.Path.absoluteRootPath, lambda at, layer=layer: _check_spec(layer, at, file.name))
+        for name in filter(None, layer.GetCompositionAssetDependencies()):
+            plain = not any(sign in name for sign in "`[]:\0") and Path(name).suffix.lower() in LAYERS
+            named = Path(os.path.realpath(path.parent / name)) if plain else folder
+            if not plain or not named.is_relative_to(folder):
+                raise FileFormatError(
+                    f"{file.name}: names the layer {name[:100]!r}, which is no USD file in its folder and is not read; "
+                    "put it there, or make one file of all with usdcat"
+                )
+            if not named.is_file():
+                raise FileFormatError(f"{file.name}: needs {name[:100]!r}, which is missing; put that file beside it")
+            waiting.append(named)
+
+        def check(at: Any, layer: Any = layer) -> None:
+            spec = layer.GetObjectAtPath(at) if at.IsPrimPath() else None
+            if spec is not None and "clips" in spec.ListInfoKeys():
+                what = f"has value clips ({at}), which are not read"
+                raise FileFormatError(f"{file.name}: {what}; make one file of all with usdcat")
+
+        layer.Traverse(Sdf.Path.absoluteRootPath, check)
     return [str(path) for path in known]
 
 
-def _inside(folder: Path, layer: Path, name: str, source: str) -> Path:
-    plain = not any(sign in name for sign in "`[]:\0") and Path(name).suffix.lower() in LAYERS
-    path = Path(os.path.realpath(layer.parent / name)) if plain else folder
-    if not plain or not path.is_relative_to(folder):
-        raise FileFormatError(
-            f"{source}: names the layer {name[:100]!r}, which is no USD file in its folder and is not read; put it "
-            "there, or make one file of all with usdcat"
-        )
-    if not path.is_file():
-        raise FileFormatError(f"{source}: needs {name[:100]!r}, which is missing; put that file beside it")
-    return path
-
-
-def _check_spec(layer: Any, at: Any, source: str) -> None:
-    spec = layer.GetObjectAtPath(at) if at.IsPrimPath() else None
-    if spec is not None and "clips" in spec.ListInfoKeys():
-        raise FileFormatError(f"{source}: has value clips ({at}), which are not read; make one file of all with usdcat")
-
-
 def _short(error: Exception) -> str:
-    """What a library says, without where in its code it says so."""
     said = re.findall(r":(\d+:\d+: .+)", str(error)) or re.findall(r" : '(.+)", str(error))
     lines = said or [line.strip() for line in str(error).splitlines() if len(line.strip()) > 3]
     return (lines[-1] if lines else type(error).__name__)[:200]
@@ -230,8 +224,7 @@ class Conversion:
 
     def _fill(self, prim: Any, node: dict[str, Any]) -> None:
         imageable = UsdGeom.Imageable(prim)
-        shows = prim.IsA(UsdGeom.Mesh) or prim.IsA(UsdGeom.Camera) or prim.HasAPI(UsdLux.LightAPI)
-        if not shows:
+        if not (prim.IsA(UsdGeom.Mesh) or prim.IsA(UsdGeom.Camera) or prim.HasAPI(UsdLux.LightAPI)):
             return
         if imageable.ComputeVisibility(FIRST) == UsdGeom.Tokens.invisible:
             self._leave("has something invisible, which is left out")
@@ -258,7 +251,6 @@ class Conversion:
         self.header["cameras"].append(entry)
 
     def _light(self, prim: Any, node: dict[str, Any]) -> None:
-        """A sphere as a point, a spot where it is shaped, and a distant light; radiant power as UsdLux defines it."""
         light, kind = UsdLux.LightAPI(prim), prim.GetTypeName()
         power = _first(light, "Intensity") * 2.0 ** _first(light, "Exposure")
         normalised = _first(light, "Normalize")
@@ -396,19 +388,20 @@ class Conversion:
             return None, "st"
         path = str(bound.GetPath())
         if path not in self._materials:
-            self._materials[path] = self._made(bound, str(bound.GetPrim().GetName()))
+            entry: dict[str, Any] = {"name": str(bound.GetPrim().GetName()), "doubleSided": True}
+            number = len(self.header["materials"])
+            self.header["materials"].append(entry)
+            self._materials[path] = number, self._look(bound.ComputeSurfaceSource()[0], number, entry)
         return self._materials[path]
 
-    def _made(self, bound: Any, name: str) -> tuple[int, str]:
-        number, shader = len(self.header["materials"]), bound.ComputeSurfaceSource()[0]
-        entry: dict[str, Any] = {"name": name, "doubleSided": True}
-        self.header["materials"].append(entry)
-        surface = entry["pbrMetallicRoughness"] = {}
+    def _look(self, shader: Any, number: int, entry: dict[str, Any]) -> str:
+        """Fill the entry of a material; return the name of its texture coordinates."""
+        surface = entry["pbrMetallicRoughness"] = dict[str, Any]()
         if not shader or shader.GetIdAttr().Get() != "UsdPreviewSurface":
             self._leave("has a material that is no UsdPreviewSurface, which is grey here")
             grey = [0.2140, 0.2140, 0.2140, 1.0]
             surface |= {"baseColorFactor": grey, "metallicFactor": 0.0, "roughnessFactor": 0.5}
-            return number, "st"
+            return "st"
         inputs = Inputs(self, shader, number)
         color, base = inputs.color("diffuseColor", (0.18, 0.18, 0.18)), inputs.texture("diffuseColor", "rgb")
         opacity, cutoff = inputs.number("opacity", 1.0), inputs.number("opacityThreshold", 0.0)
@@ -417,18 +410,17 @@ class Conversion:
             surface["baseColorTexture"] = {"index": base}
         if cut is not None and cut != base:
             self._leave("has an opacity of another picture than the colour's, which is left out")
-        if cut is not None or inputs.connected("opacity"):
+        if cut is not None or inputs.source("opacity") is not None:
             opacity = 1.0
         surface["baseColorFactor"] = [*color, opacity]
         if opacity < 1.0 or (cut is not None and cut == base):
             entry |= {"alphaMode": "MASK", "alphaCutoff": cutoff} if cutoff > 0.0 else {"alphaMode": "BLEND"}
-        surface["metallicFactor"], surface["roughnessFactor"] = 1.0, 1.0
-        packed = self._packed(inputs)
+        rough, metallic = inputs.number("roughness", 0.5), inputs.number("metallic", 0.0)
+        packed = self._packed(inputs, rough, metallic)
         if packed is None:
-            surface["metallicFactor"] = inputs.number("metallic", 0.0)
-            surface["roughnessFactor"] = inputs.number("roughness", 0.5)
+            surface |= {"metallicFactor": metallic, "roughnessFactor": rough}
         else:
-            surface["metallicRoughnessTexture"] = {"index": packed}
+            surface |= {"metallicFactor": 1.0, "roughnessFactor": 1.0, "metallicRoughnessTexture": {"index": packed}}
         normals = inputs.texture("normal", "rgb")
         if normals is not None:
             entry["normalTexture"] = {"index": normals}
@@ -439,25 +431,26 @@ class Conversion:
             entry["emissiveFactor"] = [channel / max(most, 1.0) for channel in glow]
             if most > 1.0:
                 entry["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": most}}
-        for unread in COAT:
-            if inputs.differs(unread):
-                self._leave(f"has materials with {unread}, which is left out")
-        if inputs.number("useSpecularWorkflow", 0.0):
+        specular = bool(inputs.number("useSpecularWorkflow", 0.0))
+        for name in COAT:
+            value, usual = inputs.value(name), {"occlusion": 1.0, "specularColor": None}.get(name, 0.0)
+            set_to = inputs.source(name) is not None or (value is not None and value != usual)
+            if set_to and (specular or name != "specularColor"):
+                self._leave(f"has materials with {name}, which is left out")
+        if specular:
             self._leave("has materials with a specular workflow, of which the diffuse colour is read")
         if abs(inputs.number("ior", 1.5) - 1.5) > 1e-3:
             self._leave("has materials with an ior other than 1.5, which is left out")
-        return number, inputs.uv_name
+        return inputs.uv_name
 
-    def _packed(self, inputs: Inputs) -> int | None:
-        """One picture of roughness (green) and metallic (blue), of the pictures of each; None where there is none."""
+    def _packed(self, inputs: Inputs, rough: float, metallic: float) -> int | None:
         planes = [inputs.plane(name) for name in ("roughness", "metallic")]
         size = next((plane.size for plane in planes if plane is not None), None)
         if size is None:
             return None
-        values = (inputs.number("roughness", 0.5), inputs.number("metallic", 0.0))
         channels = [
             Image.new("L", size, round(255 * min(max(value, 0.0), 1.0))) if plane is None else plane.resize(size)
-            for plane, value in zip(planes, values, strict=True)
+            for plane, value in zip(planes, (rough, metallic), strict=True)
         ]
         file = io.BytesIO()
         Image.merge("RGB", [Image.new("L", size, 255), *channels]).save(file, "PNG")
@@ -481,7 +474,6 @@ class Conversion:
         return self._numbered("textures", {"source": image, "sampler": self._numbered("samplers", sampler)})
 
     def _numbered(self, kind: str, entry: Mapping[str, Any]) -> int:
-        """The number of an entry, which is put in where there is none like it."""
         entries: list[Mapping[str, Any]] = self.header[kind]
         if entry not in entries:
             entries.append(entry)
@@ -497,45 +489,36 @@ class Inputs:
     material: int
     uv_name: str = "st"
 
-    def _source(self, name: str) -> tuple[Any, str] | None:
+    def source(self, name: str) -> tuple[Any, str] | None:
+        """The shader, and its output, that an input has in place of its own value."""
         for attribute in _producing(self.shader, name):
             prim = UsdShade.Shader(attribute.GetPrim())
             if prim and UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output:
                 return prim, UsdShade.Utils.GetBaseNameAndType(attribute.GetName())[0]
         return None
 
-    def connected(self, name: str) -> bool:
-        """Whether an input has something in place of its own value."""
-        return self._source(name) is not None
-
-    def _value(self, name: str) -> Any:
-        return None if self.connected(name) else _produced(self.shader, name)
-
-    def differs(self, name: str) -> bool:
-        """Whether an input that is not read does something."""
-        value = self._value(name)
-        zero = {"occlusion": 1.0, "specularColor": None}.get(name, 0.0)
-        workflow = name != "specularColor" or bool(self.number("useSpecularWorkflow", 0.0))
-        return workflow and (self.connected(name) or (value is not None and value != zero))
+    def value(self, name: str) -> Any:
+        """An input's own value."""
+        return None if self.source(name) is not None else _produced(self.shader, name)
 
     def number(self, name: str, otherwise: float) -> float:
         """A number; that of the format where the surface says none."""
-        value = self._value(name)
+        value = self.value(name)
         number = otherwise if value is None else float(value)
         return number if math.isfinite(number) else otherwise
 
     def color(self, name: str, otherwise: tuple[float, float, float]) -> tuple[float, ...]:
         """A linear colour: of a picture, what it is multiplied by."""
-        source = self._source(name)
+        source = self.source(name)
         if source is not None:
             scale = source[0].GetInput("scale")
             value, otherwise = (scale.Get(FIRST) if scale else None), (1.0, 1.0, 1.0)
         else:
-            value = self._value(name)
+            value = self.value(name)
         return otherwise if value is None else tuple(map(float, value[:3]))
 
     def _picture(self, name: str) -> tuple[bytes, Any, str] | None:
-        source = self._source(name)
+        source = self.source(name)
         if source is None:
             return None
         texture, output = source
@@ -579,7 +562,6 @@ class Inputs:
         return planes["rgba".index(output)] if output in tuple("rgba") else planes[0]
 
     def _sampler(self, texture: Any, name: str) -> dict[str, int]:
-        """How a picture goes on; its texture coordinates become those of the material."""
         wraps = []
         for axis in ("wrapS", "wrapT"):
             given = texture.GetInput(axis)
@@ -589,7 +571,12 @@ class Inputs:
             wraps.append(WRAPS.get(word, 10497))
         turned, reader = np.eye(3), self._st(texture)
         if reader is not None and reader.GetIdAttr().Get() == "UsdTransform2d":
-            turned, reader = _transform2d(reader), self._st(reader, "in")
+            inputs = (reader.GetInput(name) for name in ("scale", "rotation", "translation"))
+            scale, rotation, shift = (value.Get(FIRST) if value else None for value in inputs)
+            angle = math.radians(rotation or 0.0)  # counter-clockwise
+            turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+            turned[:2, :2], turned[:2, 2] = turn @ np.diag(scale or (1.0, 1.0)), shift or (0.0, 0.0)
+            reader = self._st(reader, "in")
         if reader is not None and reader.GetInput("varname"):
             self.uv_name = str(_produced(reader, "varname") or "st")
         known = self.conversion.transforms.setdefault(self.material, turned)
@@ -606,29 +593,16 @@ class Inputs:
 _TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 
 
-def _transform2d(shader: Any) -> Array:
-    """The matrix (3, 3) of a UsdTransform2d: scaled, turned counter-clockwise in degrees, moved."""
-    inputs = (shader.GetInput(name) for name in ("scale", "rotation", "translation"))
-    scale, rotation, shift = (value.Get(FIRST) if value else None for value in inputs)
-    angle, matrix = math.radians(rotation or 0.0), np.eye(3)
-    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    matrix[:2, :2], matrix[:2, 2] = turn @ np.diag(scale or (1.0, 1.0)), shift or (0.0, 0.0)
-    return matrix
-
-
 def _first(schema: Any, name: str) -> Any:
-    """The value of a schema's attribute at the first time."""
     return getattr(schema, f"Get{name}Attr")().Get(FIRST)
 
 
 def _producing(shader: Any, name: str) -> Sequence[Any]:
-    """The attributes that an input of a shader has its value from."""
     given = shader.GetInput(name)
     return UsdShade.Utils.GetValueProducingAttributes(given) if given else ()
 
 
 def _produced(shader: Any, name: str) -> Any:
-    """The value of an input of a shader; None where there is none."""
     return next((attribute.Get(FIRST) for attribute in _producing(shader, name)), None)
 
 

@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -36,10 +35,8 @@ from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, alike, split_at_corners
 
 GROUPING = frozenset(("g", "o"))  # statements that only name parts; all parts are joined
-FREE_FORM = frozenset(
-    "bmat bsp bzp cdc cdp con cstype curv curv2 deg end hole mg parm res scrv sp step surf trim vp".split()
-)
-"""Statements of curves and curved surfaces."""
+FREE_FORM = "bmat bsp bzp cdc cdp con cstype curv curv2 deg end hole mg parm res scrv sp step surf trim vp".split()
+WITHOUT_FACES = {"p": "points", "l": "lines", **dict.fromkeys(FREE_FORM, "curves and curved surfaces")}
 MOST_NAMED = 10_000  # material files, and materials, that a file may name, before `advsearch.files.scaled`
 BEYOND = 0.01  # how far texture coordinates may lie outside of a texture before it matters how that goes on
 
@@ -62,23 +59,24 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         return tables["vt"][mapped[mine]], np.linalg.norm(face_vectors(points[position[mine]]), axis=1)
 
     reader = MtlReader(references, notes, shown_on)
-    statements = _statements(lines, notes)
-    libraries = list(dict.fromkeys(statements.libraries))
-    check_most(path, len(libraries), MOST_NAMED, "at most {} lines that name material files (mtllib)")
-    libraries = libraries_of(libraries, references)
+    named, materials, smoothing = _statements(lines, notes)
+    named = list(dict.fromkeys(named))
+    check_most(path, len(named), MOST_NAMED, "at most {} lines that name material files (mtllib)")
+    libraries = libraries_of(named, references)
     check_most(path, len(libraries), MOST_NAMED, "at most {} material files")
     for name in libraries:
         reader.read_library(name)
     points = tables["v"][:, :3]
     triangles, face = cut_up(points[corners[:, 0]], counts, notes)
     position, mapped, normal = (corners[triangles, place] for place in range(3))
-    names, material = _in_effect(statements.materials, rows[face])
+    names, material = _in_effect(materials, rows[face])
     check_most(path, len(names), MOST_NAMED, "at most {} materials")
-    smoothness, smooth = _in_effect(statements.smoothing, rows[face])
+    smoothness, smooth = _in_effect(smoothing, rows[face])
     off = np.array([*(word in ("off", "0", "") for word in smoothness), False])[smooth]
     if ((smooth >= 0) & ~off & (normal < 0).any(axis=1)).any():
         notes.say("smoothing groups are left out: its normals are made, with creases at sharp edges")
     colors = _colors(lines, tables["v"], notes)
+    colors = None if colors is None else colors[position]
     parts = []
     square, inside = np.zeros(len(mapped), np.int64), (mapped >= 0).all(axis=1)  # of UDIM; 0: one picture for all
     for number in np.unique(material[inside & (material >= 0)]):
@@ -90,53 +88,49 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
         first = chosen[0]
         name, number = names[material[first]] if material[first] >= 0 else "", int(square[first])
         painted = reader.painted(name, number) if name else Painted(ImportedSurface())
-        tint = None if colors is None else colors[position[chosen]]
         if painted is None:
             painted = Painted(ImportedSurface(name=without_comment(name)))
-            instead = f"{'neutral grey' if tint is None else 'the colour of its vertices'} is used instead"
+            instead = f"{'neutral grey' if colors is None else 'the colour of its vertices'} is used instead"
             if reader.libraries:
                 lacks = "its .mtl file lacks" if reader.libraries == 1 else "its .mtl files lack"
                 notes.say(f" uses the material {shown(name)}, which {lacks}; {instead}")
-            elif not statements.libraries:  # else it is said already that none could be read
+            elif not named:  # else it is said already that none could be read
                 notes.say(f" uses materials and names no material file (mtllib); {instead}")
-        surface, tint = _tinted(notes, painted.surface, tint)
-        uvs = Looked(tables["vt"], mapped).at(chosen)
-        if uvs is not None:
-            uvs = replace(uvs, values=(uvs.values - mtl_surfaces.corner_of(number)) * painted.scale + painted.offset)
-            used = uvs.values[uvs.index[(uvs.index >= 0).all(axis=1)]]
-            if painted.clamped and len(used) and not (used.min() >= -BEYOND and used.max() <= 1.0 + BEYOND):
-                notes.say(" has textures that are not to repeat beyond their edges (-clamp); here they do")
-        at, normals = Looked(points, position[chosen]), Looked(tables["vn"], normal).at(chosen)
-        parts.append(split_at_corners(at, normals, uvs, tint, surface, flat=bool(off[first])))
+        surface, tint = painted.surface, colors
+        if tint is not None and surface.texture is not None:
+            if tint[chosen].min() < 1.0:
+                notes.say("colours of vertices are left out where there is a texture")
+            tint = None
+        elif tint is not None and surface.color is None:
+            surface = replace(surface, color=np.ones(3, np.float32))
+        elif tint is not None and surface.color[:3].min() < 0.999 and tint[chosen].min() < 1.0:
+            notes.say("colours of vertices are multiplied by the Kd of their material")
+        uvs = (tables["vt"] - mtl_surfaces.corner_of(number)) * painted.scale + painted.offset
+        used = uvs[mapped[chosen]] if inside[first] else np.zeros(0)
+        if painted.clamped and len(used) and not (used.min() >= -BEYOND and used.max() <= 1.0 + BEYOND):
+            notes.say(" has textures that are not to repeat beyond their edges (-clamp); here they do")
+        looked_up = Looked(points, position), Looked(tables["vn"], normal), Looked(uvs, mapped)
+        parts.append(split_at_corners(chosen, *looked_up, tint, surface, flat=bool(off[first])))
     return parts
 
 
-class _Statements(NamedTuple):
-    """What stands after ``mtllib``, names after ``usemtl`` and words after ``s``, with the rows that they are in."""
-
-    libraries: list[str]
-    materials: list[tuple[int, str]]
-    smoothing: list[tuple[int, str]]
-
-
-def _statements(lines: Lines, notes: Notes) -> _Statements:
-    """Read the statements that are no numbers; what nothing becomes of is put into the inventory."""
-    statements = _Statements([], [], [])
+def _statements(lines: Lines, notes: Notes) -> tuple[list[str], list[tuple[int, str]], list[tuple[int, str]]]:
+    """Return what stands after ``mtllib``, names after ``usemtl`` and words after ``s``, with the rows that these are
+    in; statements of which nothing becomes are noted."""
+    libraries, materials, smoothing = list[str](), list[tuple[int, str]](), list[tuple[int, str]]()
     for row, word, rest in lines.others():
         key, plain = word.lower(), without_comment(rest).lower()
         if key == "mtllib":
-            statements.libraries.append(rest)
+            libraries.append(rest)
         elif key == "usemtl":
-            statements.materials.append((row, " ".join(rest.split())))
+            materials.append((row, " ".join(rest.split())))
         elif key == "s":
-            statements.smoothing.append((row, plain))
-        elif key in ("p", "l"):
-            notes.has("points, statement" if key == "p" else "lines, statement", key)
-        elif key in FREE_FORM:
-            notes.has("curves and curved surfaces, statement", key)
+            smoothing.append((row, plain))
+        elif key in WITHOUT_FACES:
+            notes.has(f"{WITHOUT_FACES[key]}, statement", key)
         elif key not in GROUPING and plain not in ("off", "0"):
             notes.has("statement", word)
-    return statements
+    return libraries, materials, smoothing
 
 
 def _in_effect(changes: list[tuple[int, str]], rows: Ints) -> tuple[list[str], Ints]:
@@ -163,21 +157,6 @@ def _colors(lines: Lines, table: Doubles, notes: Notes) -> Doubles | None:
     scale = 255.0 if known.any() and given[known].max() > 2.0 else 1.0
     colors = np.where(known[:, None], given / scale, NEUTRAL)
     return np.asarray(srgb_to_linear(np.clip(colors, 0.0, 1.0).astype(np.float32)), dtype=np.float64)
-
-
-def _tinted(notes: Notes, surface: ImportedSurface, tint: Doubles | None) -> tuple[ImportedSurface, Doubles | None]:
-    """Return a surface and the colours (F, 3, 3) of its corners that multiply it: all but those of a texture."""
-    if tint is None:
-        return surface, None
-    if surface.texture is not None:
-        if tint.min() < 1.0:
-            notes.say("colours of vertices are left out where there is a texture")
-        return surface, None
-    if surface.color is None:
-        return replace(surface, color=np.ones(3, np.float32)), tint
-    if surface.color[:3].min() < 0.999 and tint.min() < 1.0:
-        notes.say("colours of vertices are multiplied by the Kd of their material")
-    return surface, tint
 
 
 Bytes = npt.NDArray[np.uint8]
@@ -316,7 +295,6 @@ class Lines:
         return np.frombuffer(bytes.fromhex(digits.decode()), np.uint8).reshape(-1, 4)[:, 1:].astype(np.float64)
 
     def _of(self, kind: str) -> tuple[Ints, Bytes]:
-        """Return the rows of a kind, and their bytes without keywords and comments."""
         mine, lengths = self.kind == KINDS.index(kind), self.ends - self.starts + 1
         rows = np.flatnonzero(mine)
         data = self.bytes[np.repeat(mine, lengths)]

@@ -12,15 +12,17 @@ Only the standard library is imported here: the set-up script runs this file bef
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import ctypes.util
 import functools
 import os
+import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError, EnvironmentSetupError
@@ -59,23 +61,13 @@ Version = tuple[int, ...]
 
 
 @dataclass(frozen=True)
-class LLVM:
-    """A libLLVM that Dr.Jit can use: its file, and its version as numbers, major first."""
-
-    path: Path
-    version: Version
-
-    def __str__(self) -> str:
-        return f"{'.'.join(map(str, self.version))} ({self.path})"
-
-
-@dataclass(frozen=True)
 class LibraryFile:
-    """A file that was found, its version (empty if it could not be told) and why it is refused (empty if it is not)."""
+    """A libLLVM file, its version as numbers, major first (empty if it could not be told), and why Dr.Jit cannot use it
+    (empty if it can)."""
 
     path: Path
     version: Version
-    refused: str
+    refused: str = ""
 
     def __str__(self) -> str:
         version = ".".join(map(str, self.version)) or "version unknown"
@@ -85,17 +77,34 @@ class LibraryFile:
 def find(root: Path = Path("/"), environ: Mapping[str, str] = os.environ) -> list[LibraryFile]:
     """Every libLLVM of this machine, usable ones first, each group newest first; `DRJIT_LIBLLVM_PATH` is not looked at.
     Tests give another root of the file system; ``CONDA_PREFIX`` is read from `environ`."""
-    links = {path.resolve(): path for path in _files(root, environ)}
+    patterns = list(_PATTERNS)
+    if prefix := environ.get("CONDA_PREFIX", ""):  # an active conda environment
+        inside = Path(prefix).relative_to(Path(prefix).anchor).as_posix()
+        for folder in (f"{inside}/lib", f"{inside}/Library/bin"):
+            patterns += [f"{folder}/{name}" for name in ("libLLVM*.so*", "libLLVM*.dylib", "LLVM-C.dll")]
+    paths = [path for pattern in patterns for path in root.glob(pattern) if _NAME.fullmatch(path.name)]
+    library = ctypes.util.find_library("LLVM") if root == Path("/") else None
+    if library and os.sep in library:
+        paths.append(Path(library))
+    links = {path.resolve(): path for path in paths if path.is_file()}
     candidates = [examine(path, name_hint=link) for path, link in links.items()]
     return sorted(candidates, key=lambda candidate: (not candidate.refused, candidate.version), reverse=True)
 
 
-def examine(path: Path, *, name_hint: Path | None = None) -> LibraryFile:
+def examine(path: Path, *, name_hint: Path) -> LibraryFile:
     """Say which version a libLLVM file is, symbolic links resolved, from its name, else from that of the link through
     which it was found, or else by asking it; and whether Dr.Jit can use it."""
-    if problem := _unreadable(path):
-        return LibraryFile(path, (), problem)
-    version = version_in(path) or (version_in(name_hint) if name_hint else ()) or asked_version(str(path))
+    own, head = own_elf_header(), b""
+    try:
+        with path.open("rb") as file:
+            head = file.read(20)
+    except OSError as error:
+        return LibraryFile(path, (), f"it cannot be read: {error.strerror}")
+    if own and (head[:4] != b"\x7fELF" or len(head) < 20):
+        return LibraryFile(path, (), "it is not a shared library")
+    if own and (head[4:6], head[18:20]) != (own[4:6], own[18:20]):
+        return LibraryFile(path, (), "it is for another processor")
+    version = version_in(path) or version_in(name_hint) or asked_version(str(path))
     return LibraryFile(path, version, refusal(version))
 
 
@@ -105,9 +114,7 @@ def refusal(version: Version) -> str:
         return "it does not tell its version, so it is older than 16 or not LLVM"
     if version[0] < 15:
         return "Dr.Jit refuses versions below 15"
-    if version[0] < MINIMUM:
-        return "it aborts the process at the first render"
-    return ""
+    return "it aborts the process at the first render" if version[0] < MINIMUM else ""
 
 
 def version_in(path: Path) -> Version:
@@ -117,7 +124,7 @@ def version_in(path: Path) -> Version:
 
 
 @functools.cache
-def ensure_llvm() -> LLVM:
+def ensure_llvm() -> LibraryFile:
     """Choose a libLLVM and name it in ``DRJIT_LIBLLVM_PATH``, which Dr.Jit reads when it is imported.
 
     A file that the variable names already wins, whatever else there is. Call it before the first import of Mitsuba.
@@ -127,13 +134,29 @@ def ensure_llvm() -> LLVM:
             lists what was found and the command that installs a good one.
     """
     named = os.environ.get(VARIABLE, "")
-    chosen = _given(named) if named else newest(find())
-    os.environ[VARIABLE] = str(chosen.path)
+    if not named:
+        chosen = newest(find())
+        os.environ[VARIABLE] = str(chosen.path)
+        return chosen
+    path, correct = Path(named), "Correct it, or unset it to let advsearch look for one."
+    if os.sep not in named:  # the dynamic loader looks it up; only the library itself knows its version
+        version = asked_version(named)
+        chosen = LibraryFile(path, version, refusal(version))
+    elif path.is_file():
+        chosen = replace(examine(path.resolve(), name_hint=path), path=path)
+    else:
+        raise EnvironmentSetupError(
+            f"{VARIABLE}: expected a libLLVM file, got {named!r}, which does not exist. {correct}"
+        )
+    if chosen.refused:
+        raise EnvironmentSetupError(
+            f"{VARIABLE}: expected a libLLVM of version {MINIMUM} or later, got {chosen}. {correct}"
+        )
     return chosen
 
 
-def install_command(os_release: str | None = None, platform: str = sys.platform) -> str:
-    """The command that installs a good libLLVM on this machine, or one line for each known platform; by the text of
+def install_command(release: Mapping[str, str] | None = None, system: str = sys.platform) -> str:
+    """The command that installs a good libLLVM on this machine, or one line for each known platform; by the entries of
     ``/etc/os-release``, None reads it."""
     sudo = "" if hasattr(os, "geteuid") and os.geteuid() == 0 else "sudo "
     commands = {
@@ -144,38 +167,22 @@ def install_command(os_release: str | None = None, platform: str = sys.platform)
     }
     if os.environ.get("CONDA_PREFIX"):
         return commands["conda"]
-    if platform == "darwin":
+    if system == "darwin":
         return commands["Homebrew"]
-    release = read_os_release() if os_release is None else os_release
-    ids = " ".join(re.findall(r'^ID(?:_LIKE)?="?([^"\n]*)', release, re.MULTILINE)).split()
-    if "ubuntu" in ids and re.search(r'^VERSION_ID="?(1\d|2[0-3])\.', release, re.MULTILINE):
+    if release is None:
+        with contextlib.suppress(OSError):
+            release = platform.freedesktop_os_release()
+    release = release or {}
+    ids = {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
+    if "ubuntu" in ids and re.match(r"(1\d|2[0-3])\.", release.get("VERSION_ID", "")):
         return commands["conda"]  # its own packages end with LLVM 15
     for name, known in (("Debian, Ubuntu", {"debian", "ubuntu"}), ("Fedora", {"fedora", "rhel"})):
-        if known & set(ids):
+        if known & ids:
             return commands[name]
     return "\n".join(f"  {name}: {command}" for name, command in commands.items())
 
 
-def _given(value: str) -> LLVM:
-    """Check the file (or the bare library name) that the variable names."""
-    path, correct = Path(value), "Correct it, or unset it to let advsearch look for one."
-    if os.sep in value and not path.is_file():
-        raise EnvironmentSetupError(
-            f"{VARIABLE}: expected a libLLVM file, got {value!r}, which does not exist. {correct}"
-        )
-    if os.sep in value:
-        candidate = examine(path.resolve(), name_hint=path)
-    else:  # the dynamic loader looks it up; only the library itself knows its version
-        version = asked_version(value)
-        candidate = LibraryFile(path, version, refusal(version))
-    if candidate.refused:
-        raise EnvironmentSetupError(
-            f"{VARIABLE}: expected a libLLVM of version {MINIMUM} or later, got {candidate}. {correct}"
-        )
-    return LLVM(path, candidate.version)
-
-
-def newest(candidates: list[LibraryFile]) -> LLVM:
+def newest(candidates: list[LibraryFile]) -> LibraryFile:
     """The first usable candidate that can be loaded."""
     refused = [str(candidate) for candidate in candidates if candidate.refused]
     for candidate in candidates:
@@ -186,7 +193,7 @@ def newest(candidates: list[LibraryFile]) -> LLVM:
         except OSError as error:
             refused.append(f"{candidate.path} (cannot be loaded: {error})")
         else:
-            return LLVM(candidate.path, candidate.version)
+            return candidate
     there = "Found: " + "; ".join(refused) + "." if refused else "Found none."
     command = install_command()
     separator = "\n" if "\n" in command else " "
@@ -194,34 +201,6 @@ def newest(candidates: list[LibraryFile]) -> LLVM:
         f"expected a libLLVM of version {MINIMUM} or later, with which Dr.Jit compiles its kernels. {there} "
         f"Install one with:{separator}{command}{separator}or name a file in {VARIABLE}."
     )
-
-
-def _files(root: Path, environ: Mapping[str, str]) -> Iterator[Path]:
-    patterns = list(_PATTERNS)
-    if prefix := environ.get("CONDA_PREFIX", ""):  # an active conda environment
-        inside = Path(prefix).relative_to(Path(prefix).anchor).as_posix()
-        for folder in (f"{inside}/lib", f"{inside}/Library/bin"):
-            patterns += [f"{folder}/{name}" for name in ("libLLVM*.so*", "libLLVM*.dylib", "LLVM-C.dll")]
-    for pattern in patterns:
-        yield from (path for path in root.glob(pattern) if _NAME.fullmatch(path.name) and path.is_file())
-    library = ctypes.util.find_library("LLVM") if root == Path("/") else None
-    if library and os.sep in library:
-        yield Path(library)
-
-
-def _unreadable(path: Path) -> str:
-    """Why a file cannot be a library for this interpreter, or ""; only where libraries are ELF files (Linux)."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(20)
-    except OSError as error:
-        return f"it cannot be read: {error.strerror}"
-    own = own_elf_header()
-    if not own:
-        return ""
-    if head[:4] != b"\x7fELF" or len(head) < 20:
-        return "it is not a shared library"
-    return "" if (head[4:6], head[18:20]) == (own[4:6], own[18:20]) else "it is for another processor"
 
 
 @functools.cache
@@ -245,20 +224,14 @@ def asked_version(library: str) -> Version:
         return ()
 
 
-def read_os_release() -> str:
-    try:
-        return Path("/etc/os-release").read_text(encoding="utf-8")
-    except OSError:
-        return ""
-
-
 def main() -> int:
     """Print the libLLVM that advsearch will use, or why there is none (status 3)."""
     try:
-        print(ensure_llvm())
+        chosen = ensure_llvm()
     except AdvsearchError as error:
         print(f"advsearch: {error}", file=sys.stderr)
         return 3
+    print(f"{'.'.join(map(str, chosen.version))} ({chosen.path})")
     return 0
 
 

@@ -21,9 +21,10 @@ from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene import parts
+from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.mitsuba_backend.meshes import base_texture, emitter, loadable, matt, own_surface, principled
+from advsearch.scene.mitsuba_backend.meshes import base_texture, emitter, matt, own_surface, principled
 from advsearch.scene.mitsuba_backend.parts import CAMERA_NUMBERS, GROUND, color, number, scene_dict, translation
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, mi
@@ -35,9 +36,10 @@ NAME = "scene.xml"
 MATERIAL = ("roughness", "metallic", "specular", "clearcoat")
 SCATTERINGS = 3
 """Segments that paths in haze have beyond those between surfaces: stock Mitsuba counts both alike."""
+ABSENT = ("to_world", *CAMERA_NUMBERS.values())
+"""Entries that a dictionary need not have for them to be set."""
 BAKED = ("filename", "to_world", "flip_tex_coords")
 """Entries of a mesh from a file that are in the mesh that is written."""
-CAMERA = {"to_world": "to_world", "fov": "fov", **CAMERA_NUMBERS}
 
 
 def write_scene(
@@ -55,47 +57,28 @@ def write_scene(
         raise InputError("camera: stock Mitsuba has no sensor with distortion; export the run as glTF (.glb) instead")
     kind = "volpath" if scene.volumetric else "path"  # not `prbvolpath`, which starts outside of all media
     integrator: Plugin = {"type": kind, "max_depth": scene.max_depth, "rr_depth": scene.roulette, "hide_emitters": hide}
-    base = scene_dict(description, scene.resolution, filter, scene.sampler)
-    plugins = described(base, description, inputs, integrator)
-    meshes = {shape.id(): shape for shape in scene.held(inputs).shapes() if shape.is_mesh()}
-    write_xml(path, plugins, {name: mesh for name, mesh in meshes.items() if name in plugins}, note)
-
-
-def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, Tensor], integrator: Plugin) -> Plugin:
-    """Return Mitsuba's dictionary of a scene with its inputs set; a mesh is `{"type": "ply", "bsdf": ...}`.
-
-    Args:
-        base: of `scene_dict`; changed.
-        inputs: those of `MitsubaScene`, that differ from the base values.
-        integrator: the path integrator's dictionary.
-
-    Raises:
-        InputError: something in it is no part of stock Mitsuba.
-    """
+    whole: Plugin = {"integrator": integrator, **scene_dict(description, scene.resolution, filter, scene.sampler)}
     left = {name: value.detach().cpu().numpy().astype(np.float32) for name, value in inputs.items()}
-    scene: Plugin = {"type": "scene", "integrator": integrator, **base}
-    for name, key in CAMERA.items():
-        value = left.pop(f"camera.{name}", None)
-        if value is not None:
-            matrix = value.shape == (4, 4)
-            scene["camera"][key] = mi.ScalarTransform4f(value) if matrix else float(value[0])
+    if "camera.fov" in left:  # along the larger side, as in the dictionary
+        whole["camera"]["fov"] = float(left.pop("camera.fov")[0])
     if "environment.padded" in left:
-        scene["environment"]["bitmap"] = mi.Bitmap(np.ascontiguousarray(left.pop("environment.padded")[:, 1:-1]))
+        left["environment.padded"] = left["environment.padded"][:, 1:-1]
     if description.photograph is not None:
-        base_color = description.photograph.base.numpy()
-        scene[GROUND] = {"type": "ply", "bsdf": matt(left.pop("ground.reflectance", base_color))}
+        whole[GROUND] = {"type": "ply", "bsdf": matt(description.photograph.base.numpy())}
     for part in (description.meshes[OBJECT], *description.parts):
         if isinstance(part, parts.HazePart):
-            _put_haze(scene, part, left)
-        elif not isinstance(part, parts.PluginNumbers):
-            scene[part.name] = _part(description.placed(part), left)
-    numbered = [part for part in description.parts if isinstance(part, parts.PluginNumbers)]
-    for named in (each for part in numbered for each in part.numbers):
-        if named.input in left and _put(scene, named.key.split("."), left[named.input].tolist()):
-            del left[named.input]
-    if left:
-        raise InputError(f"out: stock Mitsuba has nothing for {', '.join(sorted(left))}; export another run")
-    return scene
+            _put_haze(whole, part, left)
+        elif isinstance(part, parts.MeshPart):
+            whole[part.name] = _mesh(description.placed(part), left)
+        else:
+            whole |= translation(description.placed(part)).plugins
+        if not isinstance(whole.get(part.name, {}), Mapping):
+            raise InputError(f"out: stock Mitsuba has nothing for {part.name}; export a run without it")
+    unplaced = [name for name in sorted(left) if not _put(whole, scene.declared[name][0].split("."), left[name])]
+    if unplaced:
+        raise InputError(f"out: stock Mitsuba has nothing for {', '.join(unplaced)}; export another run")
+    meshes = {shape.id(): shape for shape in scene.held(inputs).shapes() if shape.is_mesh()}
+    write_xml(path, whole, {name: mesh for name, mesh in meshes.items() if name in whole}, note)
 
 
 def _put_haze(scene: Plugin, haze: parts.HazePart, left: Plugin) -> None:
@@ -112,59 +95,46 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, left: Plugin) -> None:
     scene["integrator"]["max_depth"] += SCATTERINGS
 
 
-def _put(plugin: Plugin, key: list[str], values: list[float]) -> bool:
-    """Set a number or colour by Mitsuba's name, where that is the way to it in a dictionary; whether it is."""
+def _put(plugin: Plugin, key: list[str], value: Floats) -> bool:
+    """Set a number, colour, transform or picture by Mitsuba's name, where that is the way to it in a dictionary;
+    whether it is."""
     here, *rest = key
     if here.startswith("brdf_") and here not in plugin:  # the one surface of two sides
         here = next((name for name, inner in plugin.items() if isinstance(inner, Mapping)), here)
+    here = "bitmap" if here == "data" else here
     inner = plugin.get(here)
     if isinstance(inner, Mapping):
         plugin[here] = dict(inner)
-        return bool(rest) and _put(plugin[here], rest, values)
-    if rest or inner is None:
+        return bool(rest) and _put(plugin[here], rest, value)
+    if rest or (inner is None and here not in ABSENT):
         return False
-    plugin[here] = values if len(values) > 1 else values[0]
+    if here == "bitmap":
+        plugin[here] = mi.Bitmap(np.ascontiguousarray(value))
+    elif value.shape == (4, 4):
+        plugin[here] = mi.ScalarTransform4f(value)
+    else:
+        plugin[here] = value.tolist() if value.size > 1 else float(value[0])
     return True
 
 
-def _part(part: parts.ScenePart, left: Plugin) -> Plugin:
-    """A part's dictionary; takes its inputs from what is left."""
-    inputs = {name.partition(".")[2]: left.pop(name) for name in sorted(left) if name.startswith(f"{part.name}.")}
-    if isinstance(part, parts.MeshPart):
-        inputs.pop("vertices", None), inputs.pop("normals", None)  # the mesh that is written has them
-        color = inputs.pop("base_color", None)
-        numbers = {name: float(inputs.pop(name)[0]) for name in MATERIAL if name in inputs and part.surface is None}
-        part = replace(part, material=replace(part.material, **numbers))
-        if color is not None:
-            part = replace(part, base_color=linear_to_srgb(torch.from_numpy(color)).numpy())
-        surface = principled(part)
-        if part.surface is not None:
-            base_color = part.base_color
-            surface = own_surface(part.surface, lambda options: base_texture(base_color, options))
-        radiance = inputs.pop("radiance", None)
-        if radiance is not None:
-            part = replace(part, emission=radiance.reshape(-1, *radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)))
-        light = emitter(part)
-        plugin: Plugin = {"type": "ply", "bsdf": surface, **({"emitter": light} if light else {})}
-    elif isinstance(part, (parts.PointLamp, parts.SpotLamp, parts.BallLamp)):
-        ball = inputs.pop("ball", None)
-        triples: Plugin = {name: tuple(map(float, inputs.pop(name))) for name in list(inputs)}
-        plugin = translation(replace(part, **triples)).plugins[part.name]
-        if ball is not None:
-            plugin["to_world"] = mi.ScalarTransform4f(ball)
-    elif isinstance(part, parts.ProjectorPart):
-        plugin = translation(part).plugins[part.name]
-        plugin["to_world"] = mi.ScalarTransform4f(inputs.pop("pose"))
-        plugin["irradiance"] |= {"bitmap": mi.Bitmap(inputs.pop("pattern"))}
-    elif isinstance(part, parts.BeamLamp):
-        pose = inputs.pop("to_world", part.to_world)
-        plugin = translation(replace(part, to_world=pose)).plugins[part.name]
-    elif isinstance(part, parts.PluginPart):
-        plugin = loadable(part.plugin)
+def _mesh(part: parts.MeshPart, left: Plugin) -> Plugin:
+    """A mesh's dictionary; takes its inputs from what is left."""
+    inputs = {name.partition(".")[2]: left.pop(name) for name in list(left) if name.startswith(f"{part.name}.")}
+    if "base_color" in inputs:
+        part = replace(part, base_color=linear_to_srgb(torch.from_numpy(inputs.pop("base_color"))).numpy())
+    if "radiance" in inputs:
+        radiance = inputs.pop("radiance")
+        part = replace(part, emission=radiance.reshape(-1, *radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)))
+    if part.surface is None:
+        numbers = {name: float(inputs.pop(name)[0]) for name in MATERIAL if name in inputs}
+        surface = principled(replace(part, material=replace(part.material, **numbers)))
     else:
-        raise InputError(f"out: stock Mitsuba has nothing for {part.name}; export a run without it")
+        base_color = part.base_color
+        surface = own_surface(part.surface, lambda options: base_texture(base_color, options))
+    inputs.pop("vertices", None), inputs.pop("normals", None)  # the mesh that is written has them
     left |= {f"{part.name}.{name}": value for name, value in inputs.items()}
-    return plugin
+    light = emitter(part)
+    return {"type": "ply", "bsdf": surface, **({"emitter": light} if light else {})}
 
 
 def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -> None:

@@ -169,7 +169,6 @@ class Arrangement:
         return np.asarray((inside.mean(axis=1) > BURIED) & ~(here >= len(self.texels.of_cell)).any(axis=1))
 
     def _measured(self) -> Lobes:
-        """Those of the object, at the texel in the middle of those that least light passes."""
         here, opacity = self.texels.of(0), self._scene.made[0].meshes[OBJECT].opacity
         every = np.arange(here.start, here.stop)
         if opacity is not None:
@@ -248,7 +247,6 @@ class Arrangement:
             return Light(on_object, lit_arrays(cells, padded, texels.blurred(shown)))
 
     def _reflectance(self, color: Tensor, padded: Tensor) -> Tensor:
-        """(n, 3) of each texel, the gloss counted as if it were diffuse."""
         rows, columns = self.texels.grids[0].shape
         fine = self.finer(color).reshape(*self.fine, 3).permute(2, 0, 1)[None]
         pooled = functional.adaptive_avg_pool2d(fine, (rows, columns))[0].permute(1, 2, 0).reshape(-1, 3)

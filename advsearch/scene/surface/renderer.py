@@ -45,8 +45,7 @@ class Sketch:
     @classmethod
     def of(cls, padded: Tensor) -> Sketch:
         """Sketch a map (H, W + 2, 3)."""
-        flat = padded.reshape(-1, 3)
-        mean = flat.mean(dim=0)
+        flat, mean = padded.reshape(-1, 3), padded.reshape(-1, 3).mean(dim=0)
         return cls(mean, flat[:: max(1, len(flat) // TEXELS)] / mean.clamp_min(1e-12))
 
     def times(self, other: Sketch) -> Tensor | None:
@@ -57,25 +56,17 @@ class Sketch:
 
 
 class SurfaceRenderer(Predictor):
-    """Predicts pictures by light on surfaces, in spaces that `why_not` says nothing against.
+    """Predicts pictures by light on surfaces, in spaces that `why_not` says nothing against. All but cameras,
+    environment and base colour stays as it is at u; the seed is that of the rays that say what texels see.
 
     A picture is linear in the base colour of the object. Light that goes from the object to itself, or to the ground
-    and back, is that of the base colour `there`.
-
-    Args:
-        traced: the renderer that traces paths.
-        u: everything but cameras, environment and base colour stays as it is there.
-        seed: number of the noise of the rays that say what texels see.
-
-    Attributes:
-        arrangement: object and surroundings.
-        there: (h, w, 3) the base colour whose light between surfaces is kept; see `renew`.
-        lights_kept: by what tells their maps apart, the oldest first.
-        dropped: lights that made room for others.
-        fixed: the light of all pictures; None for that of their own environment. See `under`.
+    and back, is that of the base colour (h, w, 3) `there`; see `renew`. `lights_kept` are the lights of maps, the
+    oldest first, and `dropped` counts those that made room for others; `fixed` is the light of all pictures, None for
+    that of their own environment, see `under`.
     """
 
     fixed: Light | None = None
+    lights = 0
 
     def __init__(self, traced: Renderer, u: Tensor, seed: int) -> None:
         super().__init__(traced)
@@ -129,10 +120,6 @@ class SurfaceRenderer(Predictor):
         if self.fixed is not None:  # of its own: the rest is shared
             return self.fixed.bytes
         return self.arrangement.bytes + sum(light.bytes for light in self.lights_kept.values())
-
-    @property
-    def lights(self) -> int:
-        return 0
 
     def light(self, inputs: Mapping[str, Tensor]) -> Light:
         """Make the light under the environment of scene inputs."""

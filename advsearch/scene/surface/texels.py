@@ -46,22 +46,14 @@ BINOMIAL = (1, 4, 6, 4, 1)
 
 @dataclass(frozen=True, eq=False)
 class LitTexels:
-    """Where light is kept: those cells of all grids that lie on a surface.
+    """Where light is kept: those cells of all grids that lie on a surface."""
 
-    Attributes:
-        grids: of each surface, the searched one first.
-        places, normals: (n, 3), in world space.
-        cells: (n,) the cell of all grids that each lies in.
-        of_cell: (cells of all grids,) number of the texel that each cell has the light of, the nearest one.
-        begin: of each grid its first texel, and the number of all.
-    """
-
-    grids: tuple[TexelGrid, ...]
-    places: Floats
-    normals: Floats
-    cells: Ints
-    of_cell: Ints
-    begin: tuple[int, ...]
+    grids: tuple[TexelGrid, ...]  # of each surface, the searched one first
+    places: Floats  # (n, 3) in world space
+    normals: Floats  # (n, 3)
+    cells: Ints  # (n,) the cell of all grids that each lies in
+    of_cell: Ints  # (cells of all grids,) number of the texel that each cell has the light of, the nearest one
+    begin: tuple[int, ...]  # of each grid its first texel, and the number of all
 
     def of(self, number: int) -> slice:
         """The texels of a grid."""
@@ -118,24 +110,12 @@ def on_ground(name: str, height: float, reach: float, middle: tuple[float, float
 
 
 def between(
-    texels: LitTexels,
-    charts: Charts,
-    shape: tuple[int, int],
-    vertices: Floats,
-    normals: Floats,
-    buried: Bools,
+    texels: LitTexels, charts: Charts, shape: tuple[int, int], vertices: Floats, normals: Floats, buried: Bools
 ) -> Tensor:
-    """Return the matrix (cells of a finer grid x texels of the first surface) that smooths light and looks it up.
-
-    The weights are those of a joint bilateral filter (Petschnigg et al. 2004, section 4.1): near in the grid, near in
-    space, and facing the same way.
-
-    Args:
-        texels: of the mesh alone, or with this mesh first; `charts` as they were rasterised for these.
-        shape: rows and columns of the finer grid.
-        vertices, normals: (V, 3) in world space.
-        buried: (n,) texels that lie inside of something, whose darkness does not count outside.
-    """
+    """Return the matrix (cells of a finer grid of a `shape` x texels of the first surface) that smooths light and looks
+    it up, for texels of a mesh, alone or the first, with vertices and normals (V, 3) in world space and its charts. The
+    weights are those of a joint bilateral filter (Petschnigg et al. 2004, section 4.1): near in the grid, near in
+    space, facing the same way. The darkness of texels that are buried (n,) in something does not count outside."""
     buried = buried & ~buried.all()
     fine = rasterised(charts.mesh, shape)
     place, normal = _surface(fine, vertices, normals)
@@ -197,7 +177,6 @@ def smoothed(ground: LitTexels, lit: Bools) -> Tensor:
 
 
 def _surface(charts: Charts, vertices: Floats, normals: Floats) -> tuple[Floats, Floats]:
-    """Place and unit shading normal of each texel (h, w, 3), in world space."""
     corners = charts.mesh.faces[charts.face]
     place = np.einsum("hwk,hwkc->hwc", charts.weights, vertices[corners])
     normal = np.einsum("hwk,hwkc->hwc", charts.weights, normals[corners])
@@ -235,18 +214,13 @@ LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
 
 @dataclass(frozen=True, eq=False)
 class SkyLight:
-    """An environment (H, W + 2, 3), as the scene takes it, cut for look-ups.
+    """An environment, as the scene takes it, cut for look-ups."""
 
-    Attributes:
-        cells: (rows x columns, 3) mean radiance of each of `CELLS`, without what is hot.
-        map: `BLURRED`, (h, w, 3).
-        hot: (k, 3) unit directions in the map's own axes towards what is hot, and (k, 3) radiance times solid angle.
-    """
-
-    padded: Tensor
-    cells: Tensor
-    map: Tensor
+    padded: Tensor  # (H, W + 2, 3)
+    cells: Tensor  # (rows x columns, 3) mean radiance of each of `CELLS`, without what is hot
+    map: Tensor  # `BLURRED`, (h, w, 3)
     hot: tuple[Tensor, Tensor]
+    """(k, 3) unit directions in the map's own axes towards what is hot, and (k, 3) radiance times solid angle."""
 
 
 def sky_of(padded: Tensor) -> SkyLight:
@@ -293,7 +267,6 @@ def _hot(radiance: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _pooled(radiance: Tensor, sine: Tensor, size: tuple[int, int]) -> Tensor:
-    """The mean of each cell (h, w, 3) by solid angle."""
     weighted = torch.cat([radiance * sine[..., None], sine[..., None]], dim=-1).permute(2, 0, 1)[None]
     pooled = functional.adaptive_avg_pool2d(weighted, size)[0].permute(1, 2, 0)
     return pooled[..., :3] / pooled[..., 3:].clamp_min(1e-12)
@@ -331,11 +304,8 @@ def irradiance(
     seen: tuple[Tensor, Tensor], sky: SkyLight, direct: Tensor | None, reflectance: Tensor, bounces: int
 ) -> Tensor:
     """Return the irradiance (n, 3) of texels with some reflectance (n, 3), after so many bounces from texel to texel.
-
-    Args:
-        seen: what they see: of the sky (n, cells) and of each other (n, n), sparse, times the cosine and pi.
-        direct: (n, k) cosines towards what is hot where it is visible; None where nothing is.
-    """
+    `seen` are their views of the sky (n, cells) and of each other (n, n), sparse, times the cosine and pi; `direct` the
+    (n, k) cosines towards what is hot where it is visible, None where nothing is."""
     of_sky, of_each_other = seen
     first = of_sky @ sky.cells
     if direct is not None:

@@ -57,30 +57,18 @@ def fixed_lights(renderer: Renderer) -> bool:
 
 @dataclass(frozen=True)
 class Lighting:
-    """What of a space is power and colour of lights, exposure, or done to the finished picture.
+    """What of a space is power and colour of lights, exposure, or done to the finished picture."""
 
-    Attributes:
-        groups: by `control.parameter`, the inputs that it changes; none where only the finished picture changes.
-        harmonic: those that add spherical harmonics to the environment.
-        bright: of the others that change a map, their coordinates and what these are where it is brightest: a basis map
-            must not be black in a channel.
-    """
-
-    groups: Mapping[str, frozenset[str]]
-    harmonic: frozenset[str]
+    groups: Mapping[str, frozenset[str]]  # by `control.parameter`, the inputs changed; none if the finished picture is
+    harmonic: frozenset[str]  # those that add spherical harmonics to the environment
     bright: Sequence[tuple[slice, Tensor]] = ()
+    """Of the others that change a map, their coordinates and what these are where it is brightest: a basis map must not
+    be black in a channel."""
 
     @property
     def moved(self) -> frozenset[str]:
         """The inputs that are light and move."""
         return frozenset[str]().union(*self.groups.values()) - ON_PICTURE
-
-    def at_its_brightest(self, u: Tensor) -> Tensor:
-        """Return a configuration with as much light of the environment as there can be."""
-        lit = u.detach().clone()
-        for coordinates, values in self.bright:
-            lit[coordinates] = values
-        return lit
 
 
 def lighting(renderer: Renderer) -> Lighting:
@@ -116,7 +104,6 @@ def lighting(renderer: Renderer) -> Lighting:
 
 
 def _places(group: Group, middle: Tensor) -> Iterator[Tensor]:
-    """Configurations that differ in one group."""
     values = list(BETWEEN)
     if group.options:
         values = [(number + 0.5) / group.options for number in range(0, group.options, -(-group.options // PROBED))]
@@ -150,7 +137,6 @@ def _change(name: str, here: Tensor | None, there: Tensor | None, numbers: int) 
 
 
 def _explained(basis: Tensor, lit: Tensor) -> bool:
-    """Whether a map is a sum of others (k, H, W, 3), as far as it and the first of them are above zero."""
     both = ((basis[0] > 0.0) & (lit > 0.0)).to(torch.float32)
     span = Span(basis * both)
     left = lit * both - span.map(span.weights(lit * both))
@@ -260,8 +246,10 @@ class BasisRenderer(Predictor):
         super().__init__(traced)
         with torch.no_grad():
             moving = moving or lighting(traced)
-            brightest = traced.scene.assembly(traced.space.inputs(moving.at_its_brightest(u)))
-            self._lights = Lights(traced, moving, brightest)
+            lit = u.detach().clone()  # with as much light of the environment as there can be
+            for coordinates, values in moving.bright:
+                lit[coordinates] = values
+            self._lights = Lights(traced, moving, traced.scene.assembly(traced.space.inputs(lit)))
             linear = traced.scene.assembly(traced.space.inputs(u)).keys() & linear_inputs(traced)
             elsewhere = {name for name in linear if not name.endswith(PATTERN)}  # projectors are in the first alone
             self._of_each: list[LinearRenderer] = []

@@ -65,19 +65,13 @@ class ColouredRows:
     and unpacked for each product."""
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
-        self._shape, self._small = (rows, columns), small
+        self._shape, self._small, self.entries = (rows, columns), small, 0
         self._both_ways: tuple[Tensor, Tensor] | None = None
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         self._kept: tuple[npt.NDArray[np.float16], npt.NDArray[np.integer[Any]], npt.NDArray[np.int32]] | None = None
         self._column = np.dtype(np.uint16 if small and columns <= 1 << 16 else np.int32)
         self._colours: Floats = np.zeros((rows, 3), dtype=np.float32)
         self._kept_colours = Halves(torch.zeros(0))
-
-    @property
-    def entries(self) -> int:
-        if self._both_ways is not None:
-            return int(self._both_ways[0].values().numel())
-        return int(self._sum.nnz) if self._kept is None else len(self._kept[0])
 
     @property
     def bytes(self) -> int:
@@ -96,6 +90,7 @@ class ColouredRows:
         more = scipy.sparse.csr_matrix((values, columns.ravel().astype(np.int32), begin.astype(np.int32)), self._shape)
         more.sum_duplicates()
         self._sum = self._sum + more if self._sum.nnz else more
+        self.entries = int(self._sum.nnz)
         for channel in range(3):
             self._colours[:, channel] += np.bincount(rows, weights[:, channel], minlength=self._shape[0])
 
@@ -116,18 +111,15 @@ class ColouredRows:
 
     def times(self, values: Tensor) -> Tensor:
         """Return the matrix times (columns, 3): (rows, 3)."""
-        if self._both_ways is not None:
-            product = self._both_ways[0] @ values
-        else:
-            product = torch.from_numpy(self._shares() @ values.numpy())
+        ours = self._both_ways
+        product = ours[0] @ values if ours else torch.from_numpy(self._shares() @ values.numpy())
         return product.mul_(self._kept_colours().reshape(-1, 3))
 
     def transposed_times(self, values: Tensor) -> Tensor:
         """Return the transpose times (rows, 3): (columns, 3)."""
         coloured = values * self._kept_colours().reshape(-1, 3)
-        if self._both_ways is not None:
-            return self._both_ways[1] @ coloured
-        return torch.from_numpy(self._shares().T @ coloured.numpy())
+        ours = self._both_ways
+        return ours[1] @ coloured if ours else torch.from_numpy(self._shares().T @ coloured.numpy())
 
     def _shares(self) -> scipy.sparse.csr_matrix:
         assert self._kept is not None, "finish it first"
@@ -247,41 +239,22 @@ class TransportTooLargeError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """What a `LinearRenderer` has collected; it can be sent to another process.
+    """What a `LinearRenderer` has collected; it can be sent to another process."""
 
-    Attributes:
-        transports: by input, finished.
-        there: the inputs where it was linearised.
-        applied: the inputs that belong to the picture, not to the scene.
-        base: the picture there, linear radiance, and coverage where there is a backdrop.
-    """
-
-    transports: Mapping[str, TextureTransport]
-    there: dict[str, Tensor]
-    applied: Mapping[str, Tensor]
-    base: Halves
+    transports: Mapping[str, TextureTransport]  # by input, finished
+    there: dict[str, Tensor]  # the inputs where it was linearised
+    applied: Mapping[str, Tensor]  # those that belong to the picture, not to the scene
+    base: Halves  # the picture there, linear radiance, and coverage where there is a backdrop
     non_finite: int = 0
 
 
 class LinearRenderer(Predictor):
-    """Predicts pictures by a matrix for each base colour.
-
-    Args:
-        traced: the renderer that traces paths.
-        u: where the picture is linearised.
-        seed: number of the noise.
-        tick: told of samples a pixel as they are traced, `samples_to_collect` in all.
-        spp: samples a pixel.
-        quick: take the noise out of the rows of the matrix as it was taken out of the base picture, which they
-            resemble, and not by the denoiser.
-        names: the inputs that get a matrix; None for all base colours that the space sets. Without any there is the
-            base picture alone.
-        light: inputs in the place of those of u.
-        collected: what was collected elsewhere with the same arguments; nothing is traced then.
-
-    Raises:
-        TransportTooLargeError: a matrix would take more than `MOST_BYTES`.
-    """
+    """Predicts pictures by a matrix for each base colour, linearised at u with the noise of a seed, of so many samples
+    a pixel, of which `tick` is told as they are traced (`samples_to_collect` in all). If `quick`, the noise is taken
+    out of the rows of the matrix as out of the base picture, which they resemble, and not by the denoiser. `names` are
+    the inputs that get a matrix, None for all base colours that the space sets; without any there is the base picture
+    alone. Inputs that are `light` stand in the place of those of u. Of what was `collected` elsewhere with the same
+    arguments nothing is traced. Raises TransportTooLargeError: a matrix would take more than `MOST_BYTES`."""
 
     def __init__(
         self,
@@ -340,7 +313,6 @@ def _collected(
     names: Collection[str] | None,
     light: Mapping[str, Tensor],
 ) -> Linearised:
-    """Trace the base picture and the matrices. Arguments as of `LinearRenderer`; nobody else has this renderer."""
     before, (height, width) = renderer.non_finite, renderer.formation.resolution
     inputs = renderer.scene.assembly(renderer.space.inputs(u))
     applied = {name: value for name, value in inputs.items() if name in ON_PICTURE}

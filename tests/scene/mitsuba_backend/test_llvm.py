@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,10 +14,10 @@ import pytest
 from advsearch.errors import EnvironmentSetupError
 from advsearch.scene.mitsuba_backend import llvm
 
-DEBIAN = "ID=debian\nVERSION_ID=12\n"
-UBUNTU = 'ID=ubuntu\nID_LIKE=debian\nVERSION_ID="24.04"\n'
-UBUNTU_22 = 'ID=ubuntu\nID_LIKE=debian\nVERSION_ID="22.04"\n'
-FEDORA = "ID=fedora\nVERSION_ID=42\n"
+DEBIAN = {"ID": "debian", "VERSION_ID": "12"}
+UBUNTU = {"ID": "ubuntu", "ID_LIKE": "debian", "VERSION_ID": "24.04"}
+UBUNTU_22 = {**UBUNTU, "VERSION_ID": "22.04"}
+FEDORA = {"ID": "fedora", "VERSION_ID": "42"}
 
 linux_only = pytest.mark.skipif(not llvm.own_elf_header(), reason="libraries are not ELF files here")
 
@@ -115,7 +116,7 @@ def test_message_without_any_usable_file_lists_what_is_there_and_what_to_type(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old = library(tmp_path, "usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
-    monkeypatch.setattr(llvm, "read_os_release", lambda: DEBIAN)
+    monkeypatch.setattr(platform, "freedesktop_os_release", lambda: DEBIAN)
     monkeypatch.setattr(os, "geteuid", lambda: 1000, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     with pytest.raises(EnvironmentSetupError) as caught:
@@ -127,22 +128,22 @@ def test_message_without_any_usable_file_lists_what_is_there_and_what_to_type(
 
 
 @pytest.mark.parametrize(
-    ("release", "platform", "command"),
+    ("release", "system", "command"),
     [
         (DEBIAN, "linux", "apt-get install libllvm19"),
         (UBUNTU, "linux", "apt-get install libllvm19"),
         (UBUNTU_22, "linux", "conda install"),
         (FEDORA, "linux", "dnf install llvm-libs"),
-        ("", "darwin", "brew install llvm"),
+        ({}, "darwin", "brew install llvm"),
     ],
 )
-def test_install_command_of_each_platform_is_one_line(release: str, platform: str, command: str) -> None:
-    answer = llvm.install_command(release, platform)
+def test_install_command_of_each_platform_is_one_line(release: dict[str, str], system: str, command: str) -> None:
+    answer = llvm.install_command(release, system)
     assert command in answer and "\n" not in answer
 
 
 def test_install_command_of_an_unknown_platform_lists_all() -> None:
-    answer = llvm.install_command("ID=nixos\n", "linux")
+    answer = llvm.install_command({"ID": "nixos"}, "linux")
     assert [line.split(":")[0].strip() for line in answer.splitlines()] == [
         "Debian, Ubuntu",
         "Fedora",
@@ -159,7 +160,7 @@ def test_install_command_in_a_conda_environment_is_condas(monkeypatch: pytest.Mo
 def test_variable_wins_over_what_would_be_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given = library(tmp_path, "mine/libLLVM.so.18.1")
     monkeypatch.setenv(llvm.VARIABLE, str(given))
-    assert llvm.ensure_llvm() == llvm.LLVM(given, (18, 1))
+    assert llvm.ensure_llvm() == llvm.LibraryFile(given, (18, 1))
     assert os.environ[llvm.VARIABLE] == str(given)
 
 
