@@ -96,9 +96,10 @@ def chains_of(config: AttackConfig) -> list[Chain]:
             alone = AttackConfig.of(config, **({} if config.ensemble else {"model": name}))
             chains.append([StudyAttack(alone, f"{place:02d}-" + default_name(name, []), name)])
     else:
+        epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]  # None is the own of each control
         for place, name in enumerate(different(config.objects, "object")):
             chains.append([])
-            for epsilon in sorted(config.epsilons) or [None]:  # None is the own of each control
+            for epsilon in epsilons:
                 words = [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
                 changed = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
                 chains[-1].append(StudyAttack(changed, f"{place:02d}-" + default_name(name, words), name, epsilon))
