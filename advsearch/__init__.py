@@ -36,9 +36,7 @@ _HOMES = {
 }
 """The public names, and the module of each; besides, every question that
 `advsearch.question` makes."""
-
 _MODULES = ("controls", "losses", "maite", "testing")  # public modules
-
 __all__ = [*_HOMES, *_MODULES, *made_questions()]
 
 

@@ -48,7 +48,6 @@ SYNONYMS = {
     "input_size": "size image_size img_size resolution",
 }
 """Keywords of Python's functions, and what else they are called elsewhere."""
-
 DEVICES = ("device", "cuda", "gpu", "use_cuda")
 
 NOWHERE = {
@@ -61,17 +60,13 @@ WORDS = {
     "None": "None", "Mapping": "a mapping", "Sequence": "a list", "Callable": "a function",
 }  # fmt: skip
 
-ALIASES = frozenset(
-    "Controls Watched Given Texture Read MakeOptimiser Examples Unpack Literal Names Named Tensor".split()
-)
+ALIASES = {*"Controls Watched Given Texture Read MakeOptimiser Examples Unpack Literal Names Named Tensor".split()}
 """Names in annotations that are of no class."""
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def unexpected(function: str, given: Mapping[str, object], known: Sequence[str]) -> TypeError | None:
-    """Return the error for the first keyword that a function has not, with what it may be called here; None where all
-    are known."""
+    """Return the error for the first keyword that a function has not, with what it may be called here; or None."""
     for name in given:
         if name in known:
             continue

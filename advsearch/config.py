@@ -19,20 +19,8 @@ from advsearch import registry
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import MESHES, either
 from advsearch.options import JOINED, by_key, things_as_text
-from advsearch.settings import (
-    Clash,
-    Config,
-    as_text,
-    check_once,
-    number_or_text,
-    parse_assignment,
-    power,
-    read_controls,
-    setting,
-    setting_as_in,
-    shown,
-    split_names,
-)
+from advsearch.settings import Clash, Config, power, setting, setting_as_in
+from advsearch.settings import values as written
 
 FOLDERS = ("references", "state")
 """Options that may be a folder or a file. It is kept by its absolute path, so that a run may go on from anywhere."""
@@ -42,7 +30,7 @@ def read_named(value: Any, setting: str, otherwise: str) -> Any:
     """Return a name, or a mapping with a `name` and options, from ``NAME``, ``NAME={OPTION: VALUE}`` or such a mapping,
     which may leave out the name `otherwise`."""
     if isinstance(value, str) and "=" in value:
-        name, options = parse_assignment(value, setting)
+        name, options = written.parse_assignment(value, setting)
         value = {"name": name, **(options if isinstance(options, Mapping) else {"": options})}
     if not isinstance(value, Mapping):
         return value
@@ -75,7 +63,7 @@ def read_joined(value: Any, setting: str, otherwise: str) -> Any:
 
 def has_address(model: str) -> bool:
     """Whether a model's name is an address, or names one among several."""
-    return any(re.match("https?:", name, re.IGNORECASE) for name in split_names(model))
+    return any(re.match("https?:", name, re.IGNORECASE) for name in written.split_names(model))
 
 
 def name_in(named: str | Mapping[str, object]) -> str:
@@ -85,22 +73,16 @@ def name_in(named: str | Mapping[str, object]) -> str:
 
 DEFAULT_ENVIRONMENT = "studio"
 """What lights a scene of which nothing is said: `scene.description.DEFAULT_ENVIRONMENT`, which a test holds this to."""
-
 SEVERAL = ("object", "environment", "model", "labels", "label", "target", "held_out", "held_out_environment")
 """The settings that may be several names, where a command takes several."""
-
 TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
 """The settings that are texts, whatever they are given as."""
-
 ControlsByName = dict[str, dict[str, object]]  # controls as they are asked for: their names, each with its settings
-
 LARGE = ("car", "person", "stop-sign")  # bundled objects around which lengths were in metres in files of schema 1
 LENGTHS = frozenset({"camera.distance", "camera.height", "camera.focus", "ground.height", "ground.radius", "path"})
 """What is in metres, and was in object sizes around all others."""
-
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
-
 AUTO_SHARE = 2  # with `--spp auto` a search takes the default's samples divided by this
 CLOSE_LOOKS = 4  # then a candidate is rendered so many times more, at most, while it is not clearly worse than the best
 
@@ -110,8 +92,7 @@ class SceneConfig(Config):
     directory. None means "choose for me", and the description says how."""
 
     free: ClassVar[tuple[str, ...]] = (*Config.free, "ask")
-    several: ClassVar[tuple[str, ...]] = ()
-    """Which of object, environment and model may be several, separated by commas."""
+    several: ClassVar[tuple[str, ...]] = ()  # which of object, environment and model may be several, with commas
     # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (
         Clash(
@@ -247,7 +228,7 @@ class SceneConfig(Config):
     @model_validator(mode="after")
     def _one_of_each(self) -> SceneConfig:
         for name in ("object", "environment", "model"):
-            names, tasks = split_names(getattr(self, name) or ""), self.task_name.split(JOINED)
+            names, tasks = written.split_names(getattr(self, name) or ""), self.task_name.split(JOINED)
             if name == "model" and len(tasks) > 1:
                 if len(names) != len(tasks):
                     raise InputError(
@@ -280,7 +261,6 @@ class SceneConfig(Config):
 
     @property
     def task_name(self) -> str:
-        """Name of the task."""
         return name_in(self.task)
 
     @property
@@ -313,13 +293,12 @@ class SceneConfig(Config):
 
     @property
     def objects(self) -> tuple[str, ...]:
-        """The objects by name."""
-        return split_names(self.object)
+        return written.split_names(self.object)
 
     @property
     def models(self) -> tuple[str, ...]:
         """The models by name; those of several tasks are one together."""
-        return (self.model,) if JOINED in self.task_name else split_names(self.model)
+        return (self.model,) if JOINED in self.task_name else written.split_names(self.model)
 
     @field_validator(*TEXTS, mode="before", check_fields=False)
     @classmethod
@@ -327,7 +306,7 @@ class SceneConfig(Config):
         listed = info.field_name == "labels" and isinstance(value, (list, tuple))
         if listed and any("," in str(name) for name in value):
             raise ValueError("a name that would be two; a file can have it")
-        return as_text(value, several=info.field_name in SEVERAL)
+        return written.as_text(value, several=info.field_name in SEVERAL)
 
     _things_as_text = field_validator("things", mode="before")(things_as_text)
 
@@ -352,7 +331,7 @@ class SceneConfig(Config):
             return {name: {} if given is None else given for name, given in by_key(value).items()}
         names = [value] if isinstance(value, str) else value
         listed = isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names)
-        return read_controls(names, "controls") if listed else value
+        return written.read_controls(names, "controls") if listed else value
 
     @field_validator("estimators", mode="before", check_fields=False)
     @classmethod
@@ -377,13 +356,14 @@ class SceneConfig(Config):
     @field_validator("set_", mode="before")
     @classmethod
     def _numbers_from_text(cls, value: Any) -> Any:
-        # YAML takes 1e-3 for text
-        return {name: number_or_text(given) for name, given in value.items()} if isinstance(value, Mapping) else value
+        if not isinstance(value, Mapping):
+            return value
+        return {name: written.number_or_text(given) for name, given in value.items()}  # YAML takes 1e-3 for text
 
 
 def one_only(name: str, names: Sequence[str]) -> InputError:
     """The error for several objects, environments or models where one is looked at."""
-    listed = shown(",".join(names))
+    listed = written.shown(",".join(names))
     return InputError(f"{name}: expected one {name}, got {listed}; give one, or compare several with advsearch sweep")
 
 
@@ -476,8 +456,8 @@ class DerivativeConfig(SceneConfig):
         if isinstance(value, str):
             parts = [part.strip() for part in value.split(",")]
             if "=" in value:
-                pairs = [parse_assignment(part, "epsilon") for part in parts]
-                check_once((name for name, _ in pairs), "epsilon")
+                pairs = [written.parse_assignment(part, "epsilon") for part in parts]
+                written.check_once((name for name, _ in pairs), "epsilon")
                 value = dict(pairs)
             else:
                 value = tuple(parts)
@@ -487,7 +467,7 @@ class DerivativeConfig(SceneConfig):
         numbers = numbers if isinstance(value, (Mapping, list, tuple)) else [1.0 if value is None else value]
         read = [_positive(number) for number in numbers]
         if isinstance(value, (list, tuple)):
-            check_once((f"{number:g}" for number in read), "epsilon")
+            written.check_once((f"{number:g}" for number in read), "epsilon")
         if not read:
             raise ValueError("nothing is named")
         return value
@@ -525,13 +505,13 @@ FIRST = ("attack", "render", "sweep")  # the commands that the docs show first
 class _Configs(Mapping[str, type[Config]]):
     def __iter__(self) -> Iterator[str]:
         names = sorted(["render", *registry.rooms()], key=lambda name: (name not in FIRST, name))
-        return (name for name in names if name == "render" or registry.Room(name).config is not None)
+        return (name for name in names if name == "render" or registry.part_of(name, "config") is not None)
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
     def __getitem__(self, name: str) -> type[Config]:
-        config: type[Config] | None = RenderConfig if name == "render" else getattr(registry.room(name), "config", None)
+        config: type[Config] | None = RenderConfig if name == "render" else registry.part_of(name, "config")
         if config is None:
             raise KeyError(name)
         return config

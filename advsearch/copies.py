@@ -50,12 +50,8 @@ def is_ours(kind: type) -> bool:
 
 
 def hand_copies(kind: type, **places: slice) -> None:
-    """Have methods that a class outside of this package defines called with copies of their arguments.
-
-    Args:
-        kind: that defines them.
-        places: by name of the method, which of its arguments after `self`; those by keyword always are.
-    """
+    """Have methods that a class outside of this package defines called with copies of their arguments: by name, of
+    which after `self`, and of all by keyword."""
     if is_ours(kind):
         return
     for name, which in places.items():

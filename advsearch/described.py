@@ -13,7 +13,6 @@ class Value(TypedDict):
 
 
 NOT_A_NUMBER = "not a number"  # what an output of a model is called that has NaN or infinity in it: it has said nothing
-
 OUT_OF_VIEW = "out of view"
 """What a prediction is called where nothing of what is judged is in the picture. It is not a success of a search, and
 no share of right predictions counts it."""

@@ -50,15 +50,10 @@ TORCH: Mapping[str, tuple[str, Callable[[Any], dict[str, Any]]]] = {
 
 
 def as_setting(given: object) -> object:
-    """Return what a file says of a parameter's distribution; anything else as it is.
-
-    Args:
-        given: a distribution of torch, a frozen one of scipy, anything else with an `icdf` or a `ppf`, a function from
-            a share in [0, 1] to a value (an inverse CDF), or a mapping from choices to their weights.
-
-    Raises:
-        InputError: it is of several numbers, or of whole ones, or a function that is no inverse CDF.
-    """
+    """Return what a file says of a parameter's distribution: one of torch, a frozen one of scipy, anything else with an
+    `icdf` or a `ppf`, a function from a share in [0, 1] to a value (an inverse CDF), or a mapping from choices to their
+    weights; anything else as it is. Raises InputError: it is of several numbers, or of whole ones, or a function that
+    is no inverse CDF."""
     if isinstance(given, Mapping):
         weights = [w.item() if getattr(w, "ndim", 1) == 0 else w for w in given.values()]  # numpy's, torch's
         numbers = all(isinstance(w, (int, float)) and not isinstance(w, bool) for w in weights)
@@ -83,19 +78,15 @@ def as_setting(given: object) -> object:
         shapes, loc, scale = frozen.dist._parse_args(*frozen.args, **frozen.kwds)
         names = [name.strip() for name in (frozen.dist.shapes or "").split(",") if name.strip()]
         return _named(frozen.dist.name, {**dict(zip(names, shapes, strict=True)), "loc": loc, "scale": scale})
-    for method in ("icdf", "ppf"):
-        if hasattr(given, method):
-            return OwnQuantiles(kind.__name__, _called(given, getattr(given, method)))
+    quantile = getattr(given, "icdf", None) or getattr(given, "ppf", None)
+    if quantile and kind.__module__.startswith("torch"):
+        torch = sys.modules["torch"]  # it is there: the distribution is one of its own
+        return OwnQuantiles(kind.__name__, lambda share: float(quantile(torch.tensor(share, dtype=torch.float64))))
+    if quantile:
+        return OwnQuantiles(kind.__name__, quantile)
     if callable(given) and not isinstance(given, type):
         return OwnQuantiles(str(getattr(given, "__name__", kind.__name__)), given)
     return given
-
-
-def _called(given: object, method: Callable[[Any], Any]) -> Callable[[float], float]:
-    if not type(given).__module__.startswith("torch"):
-        return method
-    torch = sys.modules["torch"]  # it is there: the distribution is one of its own
-    return lambda share: float(method(torch.tensor(share, dtype=torch.float64)))
 
 
 def _named(name: str, parameters: Mapping[str, Any]) -> dict[str, object]:

@@ -12,8 +12,7 @@ import difflib
 import re
 from collections.abc import Iterable, Sequence
 
-SIMILAR, SIMILAR_WORD = 0.6, 0.75
-"""Least ratio of `difflib` at which a name, or one word of it, is spelled nearly like another."""
+SIMILAR, SIMILAR_WORD = 0.6, 0.75  # least ratio of `difflib` at which a name, or a word of it, is spelled nearly alike
 
 ELSEWHERE = {
     "pgd": "fgsm bim ifgsm mifgsm mi-fgsm apgd autoattack",
@@ -42,14 +41,8 @@ class InputError(AdvsearchError):
 
 
 class UnknownNameError(InputError):
-    """A name that is not in a registry; the message lists near matches.
-
-    Args:
-        kind: what the name should have named, e.g. ``"object"``.
-        name: the name that was given.
-        known: every valid name.
-        hint: an extra sentence (how to give a path instead, say); may be empty.
-    """
+    """A name of a kind ("object", say) that is not among the known ones; the message lists near matches, and may end in
+    a hint: a sentence about how to give a path instead, say."""
 
     def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
         names = sorted(known)

@@ -10,7 +10,7 @@ import json
 import math
 import os
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -21,11 +21,10 @@ from advsearch.errors import FileFormatError, InputError
 FACTOR = "ADVSEARCH_LIMITS"  # environment variable with a number that all limits on the size of input are multiplied by
 JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None  # whatever JSON can hold
 JsonObject = dict[str, JsonValue]  # A JSON object, before a type has taken it or once it has been written out
-
 MESHES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".vrm", ".blend", ".usd", ".usda", ".usdc", ".usdz")
 """Endings of the files that an object can be read from."""
-
 DEPTH = 100  # deepest nesting of JSON, in lists and objects
+DEEPEST = 16  # lists and mappings inside one another that a setting may have
 DIGITS = 300  # most digits of a whole number; more than these have no floating-point form
 
 _KINDS = (
@@ -35,7 +34,6 @@ _KINDS = (
     (stat.S_ISCHR, "a device; name an ordinary file"),
     (stat.S_ISBLK, "a device; name an ordinary file"),
 )
-
 
 _ROOT: ContextVar[str | None] = ContextVar("the file that others are read for", default=None)
 _OPENED: dict[str, dict[str, None]] = {}
@@ -81,8 +79,7 @@ def scaled(limit: int) -> int:
 
 
 def too_large(path: Path | str, expected: str, size: str) -> FileFormatError:
-    """Return the error for input over a limit, which names the setting that raises it. Expected: ``"a mesh of at most
-    100 faces"``; size: ``"120"``."""
+    """Return the error for input over a limit, which names what raises it: "a mesh of at most 100 faces", "120"."""
     return FileFormatError(
         f"{path}: expected {expected}, got {size}; if you trust it, {FACTOR}=10 in the environment makes all limits "
         "ten times as large"
@@ -131,6 +128,22 @@ def read_text(path: Path, expected: str, limit: int) -> str:
         raise FileFormatError(f"{path}: expected {expected} in UTF-8, got bytes that are not text") from None
 
 
+def present_text(path: Path | str, expected: str, limit: int) -> str:
+    """Return what `read_text` returns, and raise FileFormatError where it raises OSError, too."""
+    try:
+        return read_text(Path(path), expected, limit)
+    except OSError as error:
+        raise FileFormatError(f"{path}: expected {expected}, got {error.strerror}; check the path") from None
+
+
+def parsed(path: Path | str, text: str, kind: str, parse: Callable[[str], Any]) -> Any:
+    """Return what the text of a file says. Raises FileFormatError where it is not of its kind, such as "JSON"."""
+    try:
+        return parse(text)
+    except (ValueError, SyntaxError) as error:  # that of XML is a SyntaxError
+        raise FileFormatError(f"{path}: expected {kind}, got {error}; correct the file") from None
+
+
 def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
     """Return the value of a JSON text. Raises ValueError where it is not JSON, is nested deeper than `DEPTH`, or has a
     number of thousands of digits; with `finite` also where one is NaN or infinite. The message is short."""
@@ -139,13 +152,15 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
         value = json.loads(text, parse_int=_whole_number, parse_float=number, parse_constant=number)
     except RecursionError:
         raise ValueError(f"lists or objects nested deeper than {DEPTH}") from None
-    level = [value]
-    for _ in range(DEPTH):
-        level = [list(one.values()) if isinstance(one, dict) else one for one in level if isinstance(one, (dict, list))]
-        level = [inner for outer in level for inner in outer]
-        if not level:
-            return value
-    raise ValueError(f"lists or objects nested deeper than {DEPTH}")
+    if not is_shallow(value, DEPTH - 1):
+        raise ValueError(f"lists or objects nested deeper than {DEPTH}")
+    return value
+
+
+def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
+    """Return whether lists and mappings are nested at most so deep in `value`."""
+    inner = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
+    return levels >= 0 and all(is_shallow(part, levels - 1) for part in inner)
 
 
 def _whole_number(text: str) -> int:

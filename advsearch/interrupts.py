@@ -18,8 +18,7 @@ ONE = 0.5  # seconds within which a second signal is the same Ctrl-C: programs p
 
 
 class Interrupts:
-    """A handler of Ctrl-C as Python's own, which counts signals. Once it has `ended` they are only counted, since
-    nothing is left to interrupt."""
+    """A handler of Ctrl-C as Python's own, which counts signals; once it has `ended`, nothing is left to interrupt."""
 
     def __init__(self) -> None:
         self.count = self.handled = 0

@@ -25,8 +25,7 @@ __all__ = [
     "total_variation",
 ]  # fmt: skip
 
-Labels = Tensor | Sequence[int]
-"""(N,) int64, the right label of each picture; or indices, each of which is right for all pictures."""
+Labels = Tensor | Sequence[int]  # (N,) int64, the right label of each picture; or indices, all of which are right
 
 
 # ---- of logits (N, C), to be maximised ------------------------------------------------------------------------------

@@ -91,17 +91,11 @@ def load_model(
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """What is true of a picture, as MAITE's `ObjectDetectionTarget`.
+    """What is true of a picture, as MAITE's `ObjectDetectionTarget`."""
 
-    Attributes:
-        boxes: (D, 4) float32: x0, y0, x1, y1 in pixels.
-        labels: (D,) int64.
-        scores: (D,) float32, 1.
-    """
-
-    boxes: Tensor
-    labels: Tensor
-    scores: Tensor
+    boxes: Tensor  # (D, 4) float32: x0, y0, x1, y1 in pixels
+    labels: Tensor  # (D,) int64
+    scores: Tensor  # (D,) float32, 1
 
 
 class Scenes:

@@ -14,16 +14,13 @@ from advsearch.files import JsonValue
 
 FROM_RUN = {"set by": "the run"}  # metadata of a field that is no option: what a run works with decides it
 MOST = 1_000_000  # of whatever an option counts: no budget has more renders
-
-
 BY_KEY = "mitsuba"  # the control whose parameters have Mitsuba's names
 JOINED = "+"  # between the names of tasks that are asked of several models at once
 
 
 def by_key(controls: Mapping[str, object]) -> dict[str, object]:
     """Return controls with ``{"mitsuba:KEY": RANGE}`` as ``{"mitsuba": {KEY: RANGE}}``, all keys together.
-    ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw": {"yaw": RANGE}}``. Raises InputError: a key has no range, or is given
-    twice."""
+    ``{"pose.yaw": RANGE}`` becomes ``{"pose.yaw": {"yaw": RANGE}}``. Raises InputError: a key has no range, or two."""
     plain, ranges = dict[str, object](), dict[str, object]()
     for name, given in controls.items():
         kind, colon, key = str(name).partition(":")
@@ -64,36 +61,40 @@ def things_as_text(things: object) -> str | None:
 
 
 def _thing_as_text(thing: Mapping[str, Any]) -> str:
-    options = [f"{name}={value}" for name, value in thing.items() if name not in ("object", "x", "y")]
-    for name in ("object", "x", "y"):
-        if name not in thing:
-            raise InputError(
-                f"things: expected an object, x and y, such as {{'object': 'car', 'x': 12, 'y': 3.5}}, "
-                f"got {dict(thing)!r:.80}"
-            )
+    needed = ("object", "x", "y")
+    if not thing.keys() >= {*needed}:
+        raise InputError(
+            f"things: expected an object, x and y, such as {{'object': 'car', 'x': 12, 'y': 3.5}}, "
+            f"got {dict(thing)!r:.80}"
+        )
+    options = [f"{name}={value}" for name, value in thing.items() if name not in needed]
     return ",".join([f"{thing['object']}@{thing['x']}", f"{thing['y']}", *options])
 
 
 def declared_options(kind: type[Any]) -> dict[str, Field[Any]]:
-    """Return the options of a dataclass by name."""
     return {field.name: field for field in fields(kind) if field.init and field.metadata != FROM_RUN}
 
 
 def check_options(what: str, name: str, kind: type[Any], given: Mapping[str, object]) -> None:
-    """Check that a dataclass has such options, and that a number, a truth value or a text is one; ranges are theirs.
-    `what` is "policy", say. Raises UnknownNameError: there is no such option. Raises InputError: a value is of another
-    type."""
+    """Check that a dataclass has such options of `what` ("policy", say), and that a number, a truth value or a text is
+    one; ranges are theirs. Raises UnknownNameError: there is no such option; InputError: a value is of another type."""
     known = declared_options(kind)
     for option, value in given.items():
         if option not in known:
             raise UnknownNameError(f"option of {what} {name!r}:", option, known)
-        expected = _expected(type_of(known[option]), value)
-        if expected:
+        number = isinstance(value, (int, float)) and not isinstance(value, bool) and not abs(value) > MOST
+        whole = number and value % 1 == 0  # type: ignore[operator]
+        fits, expected = {
+            "float": (number, f"a finite number from {-MOST} to {MOST}"),
+            "int": (whole, f"a whole number from {-MOST} to {MOST}"),
+            "bool": (isinstance(value, bool), "true or false"),
+            "str": (isinstance(value, str), "a text"),
+        }.get(type_of(known[option]), (True, ""))
+        if not fits:
             raise InputError(f"{option} of {what} {name}: expected {expected}, got {value!r:.80}")
 
 
 def type_of(option: Field[Any]) -> str:
-    """Return the type of an option as it is written."""
     return str(getattr(option.type, "__name__", option.type))
 
 
@@ -102,16 +103,6 @@ def default_of(option: Field[Any]) -> Any:
     if option.default is not MISSING:
         return option.default
     return None if option.default_factory is MISSING else option.default_factory()
-
-
-def _expected(kind: str, value: object) -> str | None:
-    number = isinstance(value, (int, float)) and not isinstance(value, bool) and not abs(value) > MOST
-    return {
-        "float": None if number else f"a finite number from {-MOST} to {MOST}",
-        "int": None if number and value % 1 == 0 else f"a whole number from {-MOST} to {MOST}",  # type: ignore[operator]
-        "bool": None if isinstance(value, bool) else "true or false",
-        "str": None if isinstance(value, str) else "a text",
-    }.get(kind)
 
 
 def _as_json(value: object) -> JsonValue:
@@ -126,9 +117,8 @@ def _as_json(value: object) -> JsonValue:
 
 
 def as_setting(entry: Any) -> str | dict[str, JsonValue]:
-    """Return what a file says of a policy or a task: its name, with the options that differ from their defaults. An
-    option that is no finite number, truth value, text, or list or mapping of these, has no form there and is left
-    out."""
+    """Return what a file says of a policy or a task: its name, with the options that differ from their defaults; but
+    for those that are no finite number, truth value, text, or list or mapping of these."""
     name, options = str(entry.name), {}
     for option, declared in declared_options(type(entry)).items():
         value = getattr(entry, option)
@@ -143,8 +133,7 @@ def told(given: object) -> str:
 
 
 def check_takes(what: str, function: Callable[..., object], *names: str) -> None:
-    """Check that a user's function ("metrics: f") can be called with arguments of these names, by position; InputError
-    otherwise."""
+    """Check, by an InputError, that a user's function ("metrics: f") takes arguments of these names by position."""
     try:
         inspect.signature(function).bind(*names)
     except ValueError:  # built in: nothing to look at

@@ -17,14 +17,9 @@ from advsearch.errors import FileFormatError
 
 FORMATS = ("BMP", "DDS", "GIF", "JPEG", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
 """Formats of pictures, as Pillow names them. Pillow knows more; for some (EPS) it runs other programs."""
-
 LARGEST_FILE = 1 << 28  # bytes of a file that `upright` reads, before `advsearch.files.scaled`
-
-LARGEST_PIXELS = 1 << 26
-"""Pixels that a picture may have (8192 x 8192), before `advsearch.files.scaled`; decoded they take 4 bytes each."""
-
-MOST_SCANS = 64
-"""Scans of a progressive JPEG, each of which takes as long to decode as a picture of its own; usual are ten."""
+LARGEST_PIXELS = 1 << 26  # of a picture (8192 x 8192), before `advsearch.files.scaled`; decoded they take 4 bytes each
+MOST_SCANS = 64  # scans of a progressive JPEG, each of which takes as long to decode as a picture; usual are ten
 
 
 @contextlib.contextmanager
@@ -71,25 +66,15 @@ def opened(path: Path, limit: int) -> Iterator[Image.Image]:
 
 
 def png_of(levels: npt.NDArray[np.uint8]) -> bytes:
-    """Return a PNG file of levels (H, W, 3)."""
     file = io.BytesIO()
     Image.fromarray(levels).save(file, "PNG")
     return file.getvalue()
 
 
 def upright(path: Path, side: int) -> npt.NDArray[np.float32]:
-    """Read a picture as a viewer shows it.
-
-    Args:
-        path: the file.
-        side: longest side of the result; larger pictures are averaged down.
-
-    Returns:
-        (H, W, 3) float32 display-referred values in [0, 1], row 0 on top; what is transparent is as if it were not.
-
-    Raises:
-        FileFormatError: as for `opened` and `check_decodable`.
-    """
+    """Read a picture as a viewer shows it, averaged down where it is larger than a longest side: (H, W, 3) float32
+    display-referred values in [0, 1], row 0 on top; what is transparent is as if it were not. Raises FileFormatError:
+    as for `opened` and `check_decodable`."""
     with opened(path, LARGEST_FILE) as image:
         check_decodable(image, path)
         turned = ImageOps.exif_transpose(image)

@@ -6,8 +6,8 @@ import sys
 import threading
 import time
 import unicodedata
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import wraps
 from typing import IO, Any, Protocol, TypeVar
 
@@ -51,37 +51,28 @@ def watcher(watched: Watched) -> Progress:
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-
 PATIENCE = 2.0  # seconds after which a stage is announced where there is no terminal; a shorter one is not worth a line
 MOST_BARS = 5  # stages that a terminal shows at once
 UPDATE = 0.2  # least seconds between two changes of a notebook's line
-
 LINE_INTERVAL, LINE_SHARE = 5.0, 0.1
 """Seconds between two lines where there is no terminal, and the share of a stage's time so far that they are at least.
 """
 
 
-@contextmanager
-def watched(asked: Watched, written: Callable[[str], str] = str) -> Iterator[Progress]:
-    """Yield the progress that a call asked for, see `Watched`. `written` writes the settings that a text names as
-    whoever reads it does. Raises InputError where something else was asked for."""
+def watched(asked: Watched, written: Callable[[str], str] = str) -> AbstractContextManager[Progress]:
+    """Return the progress that a call asked for, see `Watched`, for a `with` block. `written` writes the settings that
+    a text names as whoever reads it does. Raises InputError where something else was asked for."""
     stream = sys.stderr
     shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
     if asked not in (None, True, False):
         if not callable(getattr(asked, "stage", None)):
             raise InputError(f"progress: expected True, False, None or a Progress, got {asked!r:.80}")
-        yield asked  # type: ignore[misc]
-    elif asked and getattr(shell, "kernel", None) is not None:  # a notebook asks
-        with NotebookProgress(written) as shown:
-            yield shown
-    elif asked is not False and stream is not None and stream.isatty():
-        with BarProgress(getattr(stream, "stream", stream), written) as drawn:  # behind a screen, which escapes all
-            yield drawn
-    elif asked and stream is not None:
-        with LineProgress(stream, written) as told:
-            yield told
-    else:
-        yield NullProgress()
+        return nullcontext(asked)  # type: ignore[arg-type]
+    if asked and getattr(shell, "kernel", None) is not None:  # a notebook asks
+        return NotebookProgress(written)
+    if asked is not False and stream is not None and stream.isatty():
+        return BarProgress(getattr(stream, "stream", stream), written)  # behind a screen, which escapes all
+    return LineProgress(stream, written) if asked and stream is not None else nullcontext(NullProgress())
 
 
 def shows_progress(function: Function) -> Function:
@@ -239,9 +230,8 @@ def _seconds(seconds: float) -> str:
 
 def info_text(info: dict[str, float | str]) -> str:
     """Return ``best 0.31, epsilon 0.1``."""
-    return ", ".join(
-        f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}" for name, value in info.items()
-    )
+    values = {name: f"{value:.3g}" if isinstance(value, float) else value for name, value in info.items()}
+    return ", ".join(f"{name} {value}" for name, value in values.items())
 
 
 def escaped(text: str, encoding: str = "utf-8") -> str:

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_args, get_type_hints
 
@@ -46,24 +45,18 @@ TYPES = {
 """What Python may give for a setting in place of its text."""
 
 
-class Asked(Generic[Settings]):
+class Asked(ExitStack, Generic[Settings]):
     """What a question is asked: its settings, who watches, and the folder of a run that goes on."""
 
     def __init__(self, config: Settings, progress: Progress | None = None, resumed: Path | None = None) -> None:
+        super().__init__()
         self.config, self.progress, self.resumed = config, progress or NullProgress(), resumed
-        self.ending = "done"
-        self._begun, self._open = time.perf_counter(), ExitStack()
-
-    def __enter__(self) -> Asked[Settings]:
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._open.__exit__(*error)
+        self.ending, self._begun = "done", time.perf_counter()
 
     @cached_property
     def run(self) -> RunDirectory:
         """The run, made where it is first asked for: whatever may be wrong is looked for before."""
-        return self._open.enter_context(RunDirectory.of(self.config, self.resumed))
+        return self.enter_context(RunDirectory.of(self.config, self.resumed))
 
     @contextmanager
     def until_interrupted(self) -> Iterator[None]:
@@ -96,25 +89,16 @@ def carried_out(function: Callable[[Asked[Settings]], AnyResult], asked: Asked[S
 
 
 def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path | None = None) -> Result:
-    """Ask the question that a configuration asks, and keep the run in a directory.
-
-    Args:
-        config: of any command.
-        progress: told how far it is.
-        resumed: the folder of a run to go on with; None for a new run.
-
-    Raises:
-        InputError: anything that whoever asked can put right; nothing is written then.
-    """
+    """Ask the question that the configuration of any command asks, and keep the run in a directory; `progress` is told
+    how far it is, and `resumed` is the folder of a run to go on with, None for a new one. Raises InputError: anything
+    that whoever asked can put right; nothing is written then."""
     from advsearch.api.names import check_names  # imports scipy
 
     check_names(config)
     keeps_run = resumed is None and getattr(config, "out", None) is None
     with begun(config) if keeps_run else nullcontext(resumed) as folder:  # before what is heavy is imported
-        room = registry.room(config.command)
-        ask = room.from_config if room else None
-        if ask is None:
-            ask = getattr(import_module(f"advsearch.api.{config.command}"), f"{config.command}_from_config")
+        ask = registry.part_of(config.command, "from_config")
+        ask = ask or registry.imported(f"advsearch.api.{config.command}:{config.command}_from_config")
         made = ask(config, progress=progress, **({} if folder is None else {"resumed": folder}))
     result: Result = made if isinstance(made, Result) else made.summary
     return result
@@ -148,7 +132,6 @@ class Question(Generic[AnyResult]):
         return carried_out(partial(self.function, **more), Asked(config, progress, resumed))
 
     def __call__(self, *args: Any, **settings: Any) -> AnyResult:
-        """Ask it from Python."""
         made: AnyResult = self.python(*args, **settings)
         return made
 

@@ -29,29 +29,23 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 @dataclass(eq=False, repr=False)
 class Registry(Mapping[str, Entry], Generic[Entry]):
-    """Entries by name: our own first, in the order given, then those of installed packages; ours win a name.
+    """Entries by name: our own first, in the order given, then those of installed packages; ours win a name."""
 
-    Args:
-        group: of entry points: "advsearch.policies".
-        own: our entries; one given as text, "module:attribute", is imported when it is asked for.
-        expected: what an entry is, for messages: "a subclass of Policy whose name is that of the entry point".
-        fits: whether an object under a name is one.
-        imports: whether the name "package.module:Class", of something that nobody has registered, is one too: a class
-            with a capital letter, from the Python path or the current directory.
-    """
-
-    group: str
-    own: Mapping[str, Entry | str]
-    expected: str
-    fits: Callable[[str, Any], bool]
+    group: str  # of entry points: "advsearch.policies"
+    own: Mapping[str, Entry | str]  # our entries; one given as text, "module:attribute", is imported when asked for
+    expected: str  # what an entry is, for messages: "a subclass of Policy whose name is that of the entry point"
+    fits: Callable[[str, Any], bool]  # whether an object under a name is one
+    # whether the name "package.module:Class", of something that nobody has registered, is one too: a class with a
+    # capital letter, from the Python path or the current directory
     imports: bool = False
 
     def __getitem__(self, name: str) -> Entry:
         """Return an entry. Raises InputError where the class that a name is cannot be imported, is something else, or
         must not be imported (`check_import`)."""
         if not self.names_class(name):
-            entry: Any = self.own[name] if name in self.own else self._installed[name]
-            return imported(entry) if isinstance(entry, str) else entry
+            own = self.own[name] if name in self.own else self._installed[name]
+            entry: Entry = imported(own) if isinstance(own, str) else own
+            return entry
         check_import(name)
         try:
             with current_directory_importable():
@@ -61,7 +55,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             raise InputError(f"{name}: cannot be imported ({type(error).__name__}: {error}); {mend}") from error
         if not self.fits(getattr(entry, "kind", ""), entry):
             raise InputError(f"{name}: expected {self.expected}, got {entry!r}")
-        return entry  # type: ignore[no-any-return]
+        return entry
 
     def __iter__(self) -> Iterator[str]:
         return iter([*self.own, *(name for name in self._installed if name not in self.own)])
@@ -102,7 +96,6 @@ def imported(place: str) -> Any:
 _ALLOWED: set[str] = set()
 """The Python code, and the models of libraries, that whoever uses this process has named. Of the process, so that it
 holds in every thread; empty at first, so that what only a file names is refused, whoever reads that file."""
-
 _CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*|(?:hf|timm|torchvision|https?):\S+")
 
 
@@ -124,7 +117,6 @@ def allow_code(*names: str) -> None:
 
 
 def allowed_code() -> tuple[str, ...]:
-    """Return what may be imported."""
     return tuple(sorted(_ALLOWED))
 
 
@@ -265,39 +257,20 @@ PARTS = {
     "from_config": ("carry_out", "{}_from_config"), "shown": ("result", "shown"), "claims": ("result", "claims"),
     "page": ("page", "page"),
 }  # fmt: skip
-"""Where an older form has the parts of a `Room`: a module of its folder, and the name there."""
+"""Where an older form has the parts of a question: a module of its folder, and the name there."""
 
 
-class Room:
-    """What a question has; None for what it has not. Each is imported when it is asked for.
-
-    Attributes:
-        config, result: the classes of its settings and of its result.
-        others: other classes of its result, by a field that they alone have.
-        from_config: what carries it out.
-        shown: what makes of its result what a person is shown of it.
-        claims: what yields the sentences that its result stands for.
-        page: what makes a page of its own kind.
-    """
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __getattr__(self, part: str) -> Any:
-        """Return a part."""
-        if part not in PARTS:
-            raise AttributeError(part)
-        made, (module, what) = made_question(self.name), PARTS[part]
-        if made and hasattr(made, part):
-            return getattr(made, part)
-        place = f"advsearch.questions.{self.name}" + ("" if made else f".{module}")
-        there = find_spec(place) is not None
-        return getattr(import_module(place), what.format(self.name), None) if there else None
-
-
-def room(name: str) -> Room | None:
-    """Return the question of a name; None where there is none."""
-    return Room(name) if name in rooms() else None
+def part_of(name: str, part: str) -> Any:
+    """Return a part of a question, which is imported now; None where there is no such question, or it has none: the
+    class of its settings or of its result, `others` of that by a field that they alone have, what carries it out, and
+    what makes of its result what a person is shown, the sentences that it stands for, or a page of its own kind."""
+    if name not in rooms():
+        return None
+    made, (module, what) = made_question(name), PARTS[part]
+    if made and hasattr(made, part):
+        return getattr(made, part)
+    place = f"advsearch.questions.{name}" + ("" if made else f".{module}")
+    return getattr(import_module(place), what.format(name), None) if find_spec(place) is not None else None
 
 
 def made_question(name: str) -> Any:

@@ -28,13 +28,11 @@ from advsearch.errors import InputError
 from advsearch.runs.results import ConditionRow
 
 Mask = npt.NDArray[np.bool_]
-
 FEWEST_ROWS = 100  # rows of which one half can choose and the other can count
 MOST_RULES = 5
 DEPTH = 3  # conditions of a rule, at most
 TREES = 24
-LEAST_SHARE, LEAST_ROWS, LEAST_UNITS = 0.01, 12, 3
-"""Of the rows that choose, a rule covers at least so many, and as many as so many units have."""
+LEAST_SHARE, LEAST_ROWS, LEAST_UNITS = 0.01, 12, 3  # of the rows that choose, a rule covers so many, at least
 KEPT = 0.97  # share of its weighted relative accuracy that a rule keeps when a condition is left out
 PASSES, BOUNDS = 3, 250  # how often all bounds of a rule are moved, and to how many places (quantiles) of their factor
 CHANCE = 0.01
@@ -42,8 +40,7 @@ CHANCE = 0.01
 were told, so that each may be tested at all of it (a fixed sequence: Maurer, Hothorn and Lehmacher 1995)."""
 MOST_NEEDED = 1_000_000  # rows up to which it is said how many a rule would take
 LEAST_GAP = 0.1  # by how much more often the model is wrong under a rule than elsewhere, at least
-AROUND = 270.0
-"""Degrees that the values of an angle span, at least, where it goes all the way round: a grid of four values does."""
+AROUND = 270.0  # degrees that the values of an angle span, at least, where it goes round: a grid of four values does
 ARCS = ((360.0, 180.0), (180.0, 0.0), (180.0, 90.0))
 """Of an angle that goes all the way round, trees see it once more by turn and zero, degrees: an arc through 0 is one
 interval there, and so is what lies end-on, at 0 and at 180."""
@@ -70,11 +67,6 @@ def observed(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
 def is_shown(rows: pd.DataFrame) -> Mask:
     """Return in which rows of a sweep (n,) what is judged is in the picture."""
     return np.asarray(rows["label"] != OUT_OF_VIEW)
-
-
-def is_independent(table: pd.DataFrame) -> bool:
-    """Return whether each row is a unit."""
-    return bool(table["unit"].is_unique)
 
 
 def interval_of(table: pd.DataFrame) -> tuple[float, float]:
@@ -129,7 +121,6 @@ class RuleCondition:
 
     @property
     def row(self) -> ConditionRow:
-        """It as results have it."""
         unit = f" {self.unit}" if self.unit not in ("", "1") else ""
         names, over, at_most = sorted(self.options or ()), f"over {self.low:g}", f"at most {self.high:g}"
         bounds = [text for text, end in ((over, self.low), (at_most, self.high)) if np.isfinite(end)]
@@ -159,8 +150,7 @@ def covered(conditions: RuleConditions, table: pd.DataFrame) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class CountedRule:
-    """A rule, and the rows inside it and elsewhere, of those that did not choose it and that no rule before it
-    covers."""
+    """A rule, and the rows inside it and elsewhere, of those that did not choose it and lie under no rule before."""
 
     conditions: RuleConditions
     inside: pd.DataFrame
@@ -208,8 +198,7 @@ class FoundRules:
 
 
 def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> FoundRules:
-    """Return the rules under which the model is wrong more often than elsewhere, chosen on some rows and counted on
-    others with the same factors."""
+    """Return the rules under which the model is wrong more often, chosen on some rows and counted on others."""
     rules: list[CountedRule] = []
     for number in range(MOST_RULES):
         conditions = _best(choosing, seeds.stream(seed, "rules", number))
@@ -228,7 +217,7 @@ def _best(table: pd.DataFrame, seed: int) -> RuleConditions:
     """The candidate of the largest weighted relative accuracy, as short as it can be; none where all are worthless."""
     wrong = ~table["correct"].to_numpy()
     least = max(LEAST_ROWS, round(LEAST_SHARE * len(table)))
-    if not is_independent(table):
+    if not table["unit"].is_unique:
         least = max(least, round(LEAST_UNITS * len(table) / table["unit"].nunique()))
     if len(table) < 2 * least or not 0 < int(wrong.sum()) < len(table):
         return ()
@@ -273,8 +262,7 @@ def _moved(condition: RuleCondition, table: pd.DataFrame) -> Iterator[RuleCondit
 
 
 class TreeColumn(NamedTuple):
-    """What a column of the trees' data is of: all values of a factor; the name that it is 1 of; or, of an angle that
-    goes round, where its zero is."""
+    """What a column of the trees' data is of: a factor's values, the name that it is 1 of, an angle's zero."""
 
     whole: RuleCondition
     name: str | None = None
@@ -292,21 +280,20 @@ class TreeColumn(NamedTuple):
 def _candidates(table: pd.DataFrame, least: int, seed: int) -> Iterator[RuleConditions]:
     trees_of, forests = (import_library(f"sklearn.{part}") for part in ("tree", "ensemble"))
     one_tree, forest = trees_of.DecisionTreeClassifier, forests.RandomForestClassifier
-    columns: list[npt.NDArray[np.float64]] = []
-    splits: list[TreeColumn] = []
+    columns: list[tuple[npt.NDArray[np.float64], TreeColumn]] = []
     for factor, unit in table.attrs["units"].items():
         column, whole = table[factor], RuleCondition(factor, unit)
-        if column.dtype != "category":
-            columns.append(values := column.to_numpy())
-            splits.append(TreeColumn(whole))
-            if unit == "degrees" and np.ptp(values) >= AROUND:
-                columns += [(values - zero) % turn for turn, zero in ARCS]
-                splits += [TreeColumn(replace(whole, turn=turn), zero=zero) for turn, zero in ARCS]
+        if column.dtype == "category":
+            names = column.cat.categories.tolist()
+            whole = replace(whole, options=frozenset(names))
+            columns += [((column == name).to_numpy(np.float64), TreeColumn(whole, name)) for name in names]
             continue
-        names = column.cat.categories.tolist()
-        columns += [(column == name).to_numpy(np.float64) for name in names]
-        splits += [TreeColumn(replace(whole, options=frozenset(names)), name) for name in names]
-    data, right = np.stack(columns, axis=1), table["correct"].to_numpy()
+        columns.append((values := column.to_numpy(), TreeColumn(whole)))
+        if unit == "degrees" and np.ptp(values) >= AROUND:
+            arcs = [(replace(whole, turn=turn), zero) for turn, zero in ARCS]
+            columns += [((values - zero) % arc.turn, TreeColumn(arc, zero=zero)) for arc, zero in arcs]
+    data, right = np.stack([values for values, _ in columns], axis=1), table["correct"].to_numpy()
+    splits = [split for _, split in columns]
     shape = {"max_depth": DEPTH, "min_samples_leaf": least}
     alone = one_tree(**shape, random_state=seed % 2**32)
     several = forest(TREES, **shape, max_features=0.6, random_state=seed % 2**32)

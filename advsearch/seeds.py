@@ -12,15 +12,7 @@ import numpy as np
 
 
 def stream(root: int, name: str, index: int = 0) -> int:
-    """Return the seed number `index` of the stream `name` under the root seed.
-
-    Args:
-        root: the run's root seed, at least 0.
-        name: the stream, e.g. ``"primal"``, ``"gradient"``, ``"verification"``.
-        index: position in the stream, at least 0.
-
-    Returns:
-        An integer in [0, 2**32), the same for the same arguments on every machine.
-    """
+    """Return the seed number `index` of a stream such as "primal", "gradient" or "verification" under a root seed; both
+    numbers are at least 0. It is in [0, 2**32), and the same for the same arguments on every machine."""
     sequence = np.random.SeedSequence([root, zlib.crc32(name.encode()), index])
     return int(sequence.generate_state(1, dtype=np.uint32)[0])

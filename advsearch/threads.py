@@ -20,7 +20,6 @@ from advsearch.errors import InputError
 
 OPENMP_DEFAULTS = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
 """Idle threads sleep at once: the first for GNU OpenMP (torch on Linux), the second for LLVM's and Intel's (macOS)."""
-
 _CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 _USERS_COUNT = os.environ.get("OMP_NUM_THREADS", "")
 
@@ -43,24 +42,14 @@ def cores(quota: Path = _CPU_MAX) -> int:
     return allowed
 
 
-MOST = 4
-"""Threads for each core, at most. More only wait for each other, and a file of somebody else may ask for any number."""
+MOST = 4  # of threads for each core: more only wait for each other, and somebody else's file may ask for any number
 
 
 def configure(threads: int | None = None, *, rendering: bool = True) -> int:
-    """Give Dr.Jit a number of threads and torch half as many, now and (Dr.Jit) when Mitsuba is imported later.
-
-    Args:
-        threads: how many, at least 1; at most `MOST` for each core are taken. None means what ``OMP_NUM_THREADS`` said
-            when this module was imported, and without it every core that this process may use.
-        rendering: whether renders and the model take turns; if not, torch gets all threads too.
-
-    Returns:
-        The number that Dr.Jit gets.
-
-    Raises:
-        InputError: fewer than one thread was asked for.
-    """
+    """Give Dr.Jit a number of threads and torch half as many, or all where nothing is rendered, now and (Dr.Jit) when
+    Mitsuba is imported later; return the number that Dr.Jit gets. At most `MOST` for each core are taken. None means
+    what ``OMP_NUM_THREADS`` said when this module was imported, and without it every core that this process may use.
+    Raises InputError: fewer than one thread was asked for."""
     global _chosen
     if threads is not None and threads < 1:
         raise InputError(f"threads: expected a number of at least 1, got {threads}")

@@ -15,7 +15,6 @@ from advsearch.files import DEPTH, DIGITS, scaled
 
 LARGEST = 1 << 17  # most bytes of a YAML file
 MOST_VALUES = 100_000  # most values of a YAML text, those that an alias repeats counted again
-
 _PLAIN = frozenset(f"tag:yaml.org,2002:{kind}" for kind in "str int float bool null seq map merge".split())
 
 
@@ -23,7 +22,6 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
     """The safe loader with our numbers, which checks a text before it makes anything of it."""
 
     def get_single_data(self) -> Any:
-        """Return the value of the text."""
         node = self.get_single_node()
         if node is None:
             return None
@@ -31,7 +29,6 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
         return self.construct_document(node)
 
     def construct_yaml_int(self, node: yaml.Node) -> int:
-        """Return a whole number that also has a floating-point form."""
         if len(node.value) > 4 * DIGITS or abs(number := int(super().construct_yaml_int(node))) >= 10**DIGITS:
             raise _problem(node, f"a number of more than {DIGITS} digits")
         return number

@@ -358,7 +358,7 @@ SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
         "from advsearch.cli.main import main\n"
         "with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit): main(['--help'])\n"
         "assert 'attack' in text.getvalue()",
-        "from advsearch.registry import Room, rooms\nassert [Room(name).result for name in rooms()]",
+        "from advsearch.registry import part_of, rooms\nassert [part_of(name, 'result') for name in rooms()]",
     ],
     ids=["small modules", "rooms", "help", "questions"],
 )
@@ -375,6 +375,14 @@ def test_an_attack_on_what_is_bundled_needs_little() -> None:
         "advsearch.engine.loading.load_scene('mug', 'studio')\n"
         "print([m for m in ('torch._dynamo', 'networkx', 'scipy.stats') if m in sys.modules])"
     )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_the_process_that_reads_usd_needs_little() -> None:
+    """Every such file starts one."""
+    pytest.importorskip("pxr")
+    code = f"import advsearch.scene.importing.usd_stage\n{SHOW_HEAVY}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
 

@@ -8,6 +8,7 @@ ranges.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,7 @@ from advsearch.scene import library
 from advsearch.scene.assets import Floats, ObjectAsset
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import EVERYTHING, ImageFormation
-from advsearch.scene.geometry import filling_distance
+from advsearch.scene.geometry import DEFAULT_VIEW, FRAME_FILL, camera_axes, middle
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import resolve
@@ -82,7 +83,12 @@ def random_scene(name: str, environments: str, rng: np.random.Generator) -> Scen
         **dict(zip(("ground.red", "ground.green", "ground.blue"), np.clip(ground, 0.02, 0.98), strict=True)),
     }
     scene = SceneDescription(asset, environment, resolve({key: float(value) for key, value in given.items()}))
-    return scene.with_values(camera__distance=filling_distance(scene))
+    # as far away as the object just fits into a square picture
+    offsets = scene.object.mesh.vertices.astype(np.float64) - middle(scene)
+    left, up, outwards = camera_axes(*(scene.number(name) for name in DEFAULT_VIEW)) @ offsets.T
+    tangent = FRAME_FILL * math.tan(math.radians(scene.number("camera.fov")) / 2.0)
+    distance = (outwards + np.maximum(np.abs(left), np.abs(up)) / tangent).max()
+    return scene.with_values(camera__distance=float(distance))
 
 
 def _recoloured(asset: ObjectAsset, rng: np.random.Generator) -> ObjectAsset:

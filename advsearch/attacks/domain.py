@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate, pairwise
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -25,30 +26,22 @@ TOLERANCE = 2e-6
 
 @dataclass(frozen=True)
 class Block:
-    """One contiguous slice of u and how far it may go. InputError: a value is outside what is said here.
+    """One contiguous slice of u and how far it may go. InputError: a value is outside what is said here."""
 
-    Attributes:
-        size: number of elements, at least 1.
-        norm: "linf" or "l2" for a ball around the start cut by the bounds; "box" for the bounds alone.
-        epsilon: radius of the ball in units of u, over 0 and finite; None for "box". For "l2" it is the norm of the
-            whole block, not a norm per element, so a sensible value grows with the square root of the size.
-        low, high: bounds, 0 <= low < high <= 1.
-        periodic: whether `high` and `low` are the same place (an angle): projecting wraps around. Only for "box".
-        name: of its parameter, e.g. "pose.yaw".
-        options: over 0 for a discrete choice among so many: u means option floor(u * options). Such a block has
-            size 1, norm "box" and the whole unit interval; it has no direction that is uphill.
-        reach: length of one whole step in a "box", over 0; None for half the diagonal of the bounds.
-    """
-
-    size: int
-    norm: Norm = "box"
+    size: int  # number of elements, at least 1
+    norm: Norm = "box"  # "linf" or "l2" for a ball around the start cut by the bounds; "box" for the bounds alone
     epsilon: float | None = None
+    """Radius of the ball in units of u, over 0 and finite; None for "box". For "l2" it is the norm of the whole block,
+    not a norm per element, so a sensible value grows with the square root of the size."""
     low: float = 0.0
-    high: float = 1.0
+    high: float = 1.0  # 0 <= low < high <= 1
     periodic: bool = False
-    name: str = ""
+    """Whether `high` and `low` are the same place (an angle): projecting wraps around. Only for "box"."""
+    name: str = ""  # of its parameter, e.g. "pose.yaw"
     options: int = 0
-    reach: float | None = None
+    """Over 0 for a discrete choice among so many: u means option floor(u * options). Such a block has size 1, norm
+    "box" and the whole unit interval; it has no direction that is uphill."""
+    reach: float | None = None  # length of one whole step in a "box", over 0; None for half the diagonal of the bounds
 
     def __post_init__(self) -> None:
         where = f" of {self.name!r}" if self.name else ""
@@ -99,33 +92,26 @@ class Block:
 class Domain:
     """The set of configurations a search may propose: the product of its blocks.
 
-    Attributes:
-        start: (d,) float32, the clean configuration, inside every block's bounds. A copy is kept.
-        blocks: consecutive slices of u that add up to d.
-        gradient_cost: pictures that one whole gradient costs on top of the one it belongs to: 0 for an adjoint, two
-            for each number with central differences.
-        partial_gradients: whether `evaluate` understands `gradient="free"`, the part that costs nothing.
-        exact: whether evaluations are free of noise: equal configurations have equal objectives and gradients, as where
-            a matrix predicts the pictures (docs/transport.md).
-        drawn: whether they are but for the conditions that each draws anew from a bank (docs/transport.md).
-        first: (d,) where a policy should begin, if not at the start; it moves no ball. For wrappers that begin
-            several times.
-        lower, upper: (d,) float32 bounds; those of an l-infinity ball are cut into them already.
-
     Raises:
         InputError: sizes do not add up, a cost is under 0, the start is not finite or outside the bounds, or `first`
             lies outside.
     """
 
-    start: Tensor
-    blocks: tuple[Block, ...]
+    start: Tensor  # (d,) float32, the clean configuration, inside every block's bounds; a copy is kept
+    blocks: tuple[Block, ...]  # consecutive slices of u that add up to d
     gradient_cost: int = 0
-    partial_gradients: bool = False
+    """Pictures that one whole gradient costs on top of the one it belongs to: 0 for an adjoint, two for each number
+    with central differences."""
+    partial_gradients: bool = False  # whether `evaluate` understands "free", the part of a gradient that costs nothing
     exact: bool = False
-    drawn: bool = False
+    """Whether evaluations are free of noise: equal configurations have equal objectives and gradients, as where a
+    matrix predicts the pictures (docs/transport.md)."""
+    drawn: bool = False  # whether they are but for the conditions that each draws anew from a bank (docs/transport.md)
     first: Tensor | None = None
+    """(d,) where a policy should begin, if not at the start; it moves no ball. For those that begin several times."""
     lower: Tensor = field(init=False, repr=False)
     upper: Tensor = field(init=False, repr=False)
+    """(d,) float32 bounds; those of an l-infinity ball are cut into them already."""
 
     def __post_init__(self) -> None:
         start = self.start.detach().to(torch.float32, copy=True)
@@ -183,11 +169,8 @@ class Domain:
 
     def parts(self) -> list[tuple[Block, slice]]:
         """Return every block with its slice of u."""
-        parts, begin = [], 0
-        for block in self.blocks:
-            parts.append((block, slice(begin, begin + block.size)))
-            begin += block.size
-        return parts
+        ends = [0, *accumulate(block.size for block in self.blocks)]
+        return [(block, slice(*place)) for block, place in zip(self.blocks, pairwise(ends), strict=True)]
 
     def project(self, u: Tensor) -> Tensor:
         """Return the configuration (d,) of the domain that is nearest to u (d,), both float32, finite, block by block
@@ -242,10 +225,16 @@ class Domain:
                     noise = centre_of_option(noise, block.options)
                 elif extreme and block.norm != "box":
                     noise.round_()
-                if block.norm == "l2" and block.epsilon is not None:
-                    u[part] = self.start[part] + _l2_offset(noise, block.epsilon, generator, extreme)
-                else:
+                if block.norm != "l2" or block.epsilon is None:
                     u[part] = torch.lerp(self.lower[part], self.upper[part], noise)
+                elif extreme:  # far beyond the ball, in a direction of random signs
+                    far = 2.0 * max(block.epsilon, math.sqrt(block.size))
+                    u[part] = self.start[part] + (noise * 2.0 - 1.0) * far
+                else:  # uniform in the ball (Muller 1959)
+                    direction = torch.randn(block.size, generator=generator)
+                    length = block.epsilon * math.pow(float(noise[0]), 1.0 / block.size)
+                    direction *= length / max(float(torch.linalg.vector_norm(direction)), 1e-30)
+                    u[part] = self.start[part] + direction
             drawn.append(self.project(u))
         return torch.stack(drawn)
 
@@ -282,16 +271,6 @@ def centre_of_option(u: Tensor, options: Tensor | int) -> Tensor:
     return (torch.floor(u * options).clamp_(max=options - 1) + 0.5) / options
 
 
-def _l2_offset(noise: Tensor, radius: float, generator: torch.Generator, extreme: bool) -> Tensor:
-    """An offset uniform in the l2 ball (Muller 1959), or far beyond it in a direction of random signs, 0 and 1."""
-    size = noise.numel()
-    if extreme:
-        return (noise * 2.0 - 1.0) * (2.0 * max(radius, math.sqrt(size)))
-    direction = torch.randn(size, generator=generator)
-    length = radius * math.pow(float(noise[0]), 1.0 / size)
-    return direction * (length / max(float(torch.linalg.vector_norm(direction)), 1e-30))
-
-
 CHUNK = 32768  # elements worked on at once: small enough for a core's cache, and torch uses one thread below it
 SLACK = 1e-6  # a norm at most this fraction over the radius counts as inside, so that projecting twice changes nothing
 
@@ -326,7 +305,18 @@ def project_l2_box(u: Tensor, centre: Tensor, radius: float, low: float = 0.0, h
         inside += float(rooms[-1].sum(dtype=torch.float64))
     if inside <= (radius * (1.0 + SLACK)) ** 2:
         return u.clamp(low, high)
-    t = math.sqrt(_multiplier(squares, rooms, radius**2, radius**2 / full))
+    s = radius**2 / full
+    for _ in range(_MAX_ITERATIONS):
+        value = slope = 0.0
+        for square, room in zip(squares, rooms, strict=True):
+            scaled = square * s
+            slope += float(torch.dot(square, (scaled < room).to(square.dtype)))
+            value += float(torch.minimum(scaled, room).sum(dtype=torch.float64))
+        better = s + (radius**2 - value) / slope if slope > 0.0 else s
+        if better <= s * (1.0 + 1e-7):
+            break
+        s = better
+    t = math.sqrt(s)
     projected = torch.empty_like(u)
     for out, part, middle in zip(
         torch.split(projected, CHUNK), torch.split(u, CHUNK), torch.split(centre, CHUNK), strict=True
@@ -335,21 +325,6 @@ def project_l2_box(u: Tensor, centre: Tensor, radius: float, low: float = 0.0, h
         outwards = (out - middle).abs() > ((part - middle) * t).abs()
         torch.where(outwards, torch.nextafter(out, middle), out, out=out).clamp_(low, high)
     return projected
-
-
-def _multiplier(squares: list[Tensor], rooms: list[Tensor], target: float, s: float) -> float:
-    """Solve sum_i min(s squares_i, rooms_i) = target for s by Newton's method, from an s that is not too large."""
-    for _ in range(_MAX_ITERATIONS):
-        value = slope = 0.0
-        for square, room in zip(squares, rooms, strict=True):
-            scaled = square * s
-            slope += float(torch.dot(square, (scaled < room).to(square.dtype)))
-            value += float(torch.minimum(scaled, room).sum(dtype=torch.float64))
-        better = s + (target - value) / slope if slope > 0.0 else s
-        if better <= s * (1.0 + 1e-7):
-            break
-        s = better
-    return s
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,76 +43,50 @@ class Query:
 
     A query of a search is about the picture as it is rendered, at the search's own samples and light paths, and over
     the conditions that it draws. A trial is about the picture as a file would hold it, rounded to 8 bits.
-
-    Attributes:
-        u: (d,) float32 in [0, 1], the configuration; must not be written to.
-        seed: of the noise, and of the conditions that are drawn. Equal seeds mean equal noise.
-        kind: which rows the evaluation belongs to, such as "search" or "verification"; `number`, its place among these.
-        phase: of a search; None for a trial.
-        gradient: whether the derivative is wanted. "free" only ever comes where the domain has `partial_gradients`.
-        samples: of a search: how many times its own samples per pixel to render with, at least 1. The evaluation costs
-            as many times its renders: samples * (1 + gradient_cost) with a gradient, samples without.
-        spp: of a trial: samples a pixel.
-        drawn: of a trial: whether conditions are drawn; otherwise the scene has those it comes with.
-        values: of a trial: what its row says of the configuration, which trials of one kind may have in common.
-        sought: of a trial: whether a search seeks some prediction there, so that there is a success.
-        wanted: what the evaluation is: a judgement; a picture alone; or "light", from which pictures can be predicted
-            (`advsearch.scene.transport`), at u of the whole space.
-        keep: whether the evaluation has the picture, too; of a row of a sweep, the bytes of a small one.
     """
 
-    u: Tensor
-    seed: int
-    kind: str = "search"
-    number: int = 0
-    phase: Phase | None = None
-    gradient: WhichGradient = False
+    u: Tensor  # (d,) float32 in [0, 1], the configuration; must not be written to
+    seed: int  # of the noise, and of the conditions that are drawn; equal seeds mean equal noise
+    kind: str = "search"  # which rows the evaluation belongs to, such as "search" or "verification"
+    number: int = 0  # its place among these
+    phase: Phase | None = None  # of a search; None for a trial
+    gradient: WhichGradient = False  # "free" only ever comes where the domain has `partial_gradients`
     samples: int = 1
-    spp: int = 1
-    drawn: bool = True
+    """Of a search: how many times its own samples per pixel to render with, at least 1. The evaluation costs as many
+    times its renders: samples * (1 + gradient_cost) with a gradient, samples without."""
+    spp: int = 1  # of a trial: samples a pixel
+    drawn: bool = True  # of a trial: whether conditions are drawn; otherwise the scene has those it comes with
     values: Mapping[str, Value] = field(default_factory=dict)
-    sought: bool = True
+    """Of a trial: what its row says of the configuration, which trials of one kind may have in common."""
+    sought: bool = True  # of a trial: whether a search seeks some prediction there, so that there is a success
     wanted: Literal["judgement", "picture", "light"] = "judgement"
-    keep: bool = False
+    """What the evaluation is: a judgement; a picture alone; or "light", from which pictures can be predicted
+    (`advsearch.scene.transport`), at u of the whole space."""
+    keep: bool = False  # whether it has the picture, too; of a row of a sweep, the bytes of a small one
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The answer to a query.
+    """The answer to a query."""
 
-    Attributes:
-        objective: what is maximised; a noisy number, because a render is.
-        gradient: (d,) float32 derivative of the objective with respect to u, or None where it was not asked for.
-        success: the model's prediction is what is sought, by the task. Never derived from the objective.
-        non_finite: gradient elements that were NaN or infinite and were set to zero where they arose.
-        cost: pictures that were rendered for it, at least 1: one, and those that differences took, each times
-            `samples`. An adjoint is not a picture and counts 0; `SearchResult.gradients` counts it. 0 of a row of a
-            sweep whose picture was predicted, or rendered for another model.
-        judgement: what the task says of it, for the log; None where there is no task. No policy looks at it.
-        picture: (H, W, 3) 8-bit values in [0, 1], where it was asked for.
-        light: what was asked for as "light"; of the last row of a batch of a sweep, what was predicted so far.
-        predicted: 0 if its picture was rendered; samples a pixel of what predicted it, 1 of a matrix.
-        small: JPEG file of the picture of a row of a sweep, where it is kept.
-        layers: ground truth of it by name, and notes, where they are kept.
-        seconds: that it took; None where whoever asks has to look at the clock.
-        machine: on which it was made, by its name among the workers' machines; None where that is like this one.
-        lost: true if every worker that tried it died.
-    """
-
-    objective: float
-    gradient: Tensor | None
-    success: bool
-    non_finite: int = 0
+    objective: float  # what is maximised; a noisy number, because a render is
+    gradient: Tensor | None  # (d,) float32, of the objective by u; None where it was not asked for
+    success: bool  # the model's prediction is what is sought, by the task; never derived from the objective
+    non_finite: int = 0  # gradient elements that were NaN or infinite and were set to zero where they arose
     cost: int = 1
+    """Pictures that were rendered for it, at least 1: one, and those that differences took, each times `samples`. An
+    adjoint is not a picture and counts 0; `SearchResult.gradients` counts it. 0 of a row of a sweep whose picture was
+    predicted, or rendered for another model."""
     judgement: Judgement | None = None
-    picture: Tensor | None = None
-    light: Any = None
-    predicted: int = 0
-    small: bytes | None = None
-    layers: tuple[Mapping[str, Any], Mapping[str, str]] | None = None
-    seconds: float | None = None
-    machine: str | None = None
-    lost: bool = False
+    """What the task says of it, for the log; None where there is no task. No policy looks at it."""
+    picture: Tensor | None = None  # (H, W, 3) 8-bit values in [0, 1], where it was asked for
+    light: Any = None  # what was asked for as "light"; of a sweep's last row of a batch, what was predicted so far
+    predicted: int = 0  # 0 if its picture was rendered; samples a pixel of what predicted it, 1 of a matrix
+    small: bytes | None = None  # JPEG file of the picture of a row of a sweep, where it is kept
+    layers: tuple[Mapping[str, Any], Mapping[str, str]] | None = None  # ground truth by name, and notes, where kept
+    seconds: float | None = None  # that it took; None where whoever asks has to look at the clock
+    machine: str | None = None  # on which it was made, by its name among the workers'; None of one like this
+    lost: bool = False  # whether every worker that tried it died
 
     @classmethod
     def of(cls, judgement: Judgement, **more: Any) -> Evaluation:
@@ -132,30 +106,29 @@ class Evaluation:
         """Whether the objective is a number that can be compared."""
         return math.isfinite(self.objective)
 
+    def usable(self) -> Evaluation:
+        """Return the evaluation as policies may see it: every number in it can be computed with.
+
+        The rule, the same for every policy:
+
+        - gradient elements that are NaN or infinite become zero and are added to `non_finite`;
+        - an objective that is NaN or infinite becomes -inf ("the worst there is"), its gradient zero and its success
+          false.
+        """
+        evaluation, gradient = self, self.gradient
+        if gradient is not None and not math.isfinite(float(gradient.sum(dtype=torch.float64))):
+            if bad := int((~torch.isfinite(gradient)).sum()):
+                gradient = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
+                evaluation = replace(evaluation, gradient=gradient, non_finite=evaluation.non_finite + bad)
+        if evaluation.finite:
+            return evaluation
+        zero = None if gradient is None else torch.zeros_like(gradient)
+        return replace(evaluation, objective=-math.inf, gradient=zero, success=False)
+
 
 Evaluate = Callable[[Sequence[Query]], Iterable[Evaluation]]
 """Answers queries, in their order, each when it is asked for; whoever stops asking leaves the rest undone. Supplied by
 whoever owns the scene. `functools.partial(map, f)` makes one of a function of one query."""
-
-
-def usable(evaluation: Evaluation) -> Evaluation:
-    """Return the evaluation as policies may see it: every number in it can be computed with.
-
-    The rule, the same for every policy:
-
-    - gradient elements that are NaN or infinite become zero and are added to `non_finite`;
-    - an objective that is NaN or infinite becomes -inf ("the worst there is"), its gradient zero and its success
-      false.
-    """
-    gradient = evaluation.gradient
-    if gradient is not None and not math.isfinite(float(gradient.sum(dtype=torch.float64))):
-        if bad := int((~torch.isfinite(gradient)).sum()):
-            gradient = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
-            evaluation = replace(evaluation, gradient=gradient, non_finite=evaluation.non_finite + bad)
-    if evaluation.finite:
-        return evaluation
-    zero = None if gradient is None else torch.zeros_like(gradient)
-    return replace(evaluation, objective=-math.inf, gradient=zero, success=False)
 
 
 State = TypeVar("State")
@@ -182,6 +155,14 @@ class Proposal:
     def cost(self, domain: Domain) -> int:
         """Return the renders that this takes at most."""
         return self.samples * (1 + (domain.gradient_cost if self.gradient is True else 0))
+
+    def affordable(self, domain: Domain, left: int) -> Proposal:
+        """Return the proposal as far as `left` renders, at least 1, allow: no more samples than these, and no gradient
+        after which no render would be left to use it."""
+        proposal = replace(self, samples=left) if self.samples > left else self
+        if proposal.gradient and proposal.cost(domain) >= left:
+            return replace(proposal, gradient=False)
+        return proposal
 
 
 @dataclass(frozen=True)
@@ -279,16 +260,6 @@ class Policy(ABC, Generic[State]):
     def failures(self, state: State) -> Failures | None:
         """Return the different failures that the policy has met, if it looks for more than one."""
         return None
-
-
-def affordable(proposal: Proposal, domain: Domain, left: int) -> Proposal:
-    """Return the proposal as far as `left` renders, at least 1, allow: no more samples than these, and no gradient
-    after which no render would be left to use it."""
-    if proposal.samples > left:
-        proposal = replace(proposal, samples=left)
-    if proposal.gradient and proposal.cost(domain) >= left:
-        return replace(proposal, gradient=False)
-    return proposal
 
 
 def draw_seed(generator: torch.Generator) -> int:

@@ -19,6 +19,7 @@ import inspect
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, final
 
 import torch
@@ -123,8 +124,8 @@ def checked(function: Callable[..., Tensor]) -> Objective:
                 f"{truth}); use those of advsearch.losses, or name one with `label`"
             ) from error
         if isinstance(values, Tensor) and values.ndim == 0 and count > 1:
-            each = [objective(output[k : k + 1], images[k : k + 1], truth, _part(asked, k)) for k in range(count)]
-            values = torch.cat(each)
+            parts = [(slice(k, k + 1), partial(_of_one, asked, k)) for k in range(count)]
+            values = torch.cat([objective(output[part], images[part], truth, more) for part, more in parts])
         values = _values(name, values, count)
         if values.requires_grad and any(tensor._version for tensor in _tensors((handed, handed_by_name))):
             read = [tensor for tensor in _tensors((output, asked)) if tensor.requires_grad]
@@ -194,15 +195,10 @@ def labels_of(truth: Any, output: Any, count: int) -> Any:
     return truth
 
 
-def _part(asked: Mapping[str, Any], picture: int) -> More:
-    """Return what gives what was asked for of several pictures for one of them."""
-    part = slice(picture, picture + 1)
-
-    def more(name: str) -> Any:
-        value = asked[name]
-        return value[part] if isinstance(value, Tensor) else {key: values[part] for key, values in value.items()}
-
-    return more
+def _of_one(asked: Mapping[str, Any], picture: int, name: str) -> Any:
+    """Return what was asked for of several pictures for one of them."""
+    value, part = asked[name], slice(picture, picture + 1)
+    return value[part] if isinstance(value, Tensor) else {key: values[part] for key, values in value.items()}
 
 
 @final

@@ -14,19 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Candidate, Failures, admit, best, contenders, with_last
 from advsearch.attacks.domain import TOLERANCE, Distribution, Domain
-from advsearch.attacks.evaluation import (
-    NO_COUNTS,
-    Counts,
-    Evaluate,
-    Evaluation,
-    Phase,
-    Policy,
-    Proposal,
-    Query,
-    affordable,
-    most_at_once,
-    usable,
-)
+from advsearch.attacks.evaluation import Counts, Evaluate, Evaluation, Phase, Policy, Proposal, Query, most_at_once
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.attacks.verification import Ending
 from advsearch.copies import copied
@@ -39,38 +27,23 @@ NON_FINITE_LIMIT = 3  # non-finite objectives in a row after which a search give
 
 @dataclass(frozen=True)
 class StepRecord:
-    """One evaluation, without its tensors.
+    """One evaluation, without its tensors."""
 
-    Attributes:
-        step: number of the evaluation, from 0; ranking goes on counting.
-        seed, samples: that it was rendered with; the second as of `Proposal`.
-        phase: "search", or "ranking" for a candidate rendered again at the end.
-        objective: raw objective; NaN where it was not finite.
-        best: best raw objective of the search so far; NaN before there is one. Biased upwards.
-        success: whether the model was wrong on this render.
-        step_size: the policy's, in units of each block's radius; NaN where it has none.
-        gradient_norm: l2 norm of the gradient after cleaning; NaN without one.
-        non_finite: gradient elements that had to be set to zero.
-        seconds: time the evaluation took.
-        renders: pictures that all evaluations so far took together, this one included.
-    """
-
-    step: int
-    seed: int
-    phase: Phase
-    objective: float
-    best: float
-    success: bool
-    step_size: float
-    gradient_norm: float
-    non_finite: int
-    seconds: float
-    renders: int = 0
-    samples: int = 1
+    step: int  # number of the evaluation, from 0; ranking goes on counting
+    seed: int  # that it was rendered with
+    phase: Phase  # "search", or "ranking" for a candidate rendered again at the end
+    objective: float  # raw; NaN where it was not finite
+    best: float  # best raw objective of the search so far, biased upwards; NaN before there is one
+    success: bool  # whether the model was wrong on this render
+    step_size: float  # the policy's, in units of each block's radius; NaN where it has none
+    gradient_norm: float  # l2 norm of the gradient after cleaning; NaN without one
+    non_finite: int  # gradient elements that had to be set to zero
+    seconds: float  # that the evaluation took
+    renders: int = 0  # pictures that all evaluations so far took together, this one included
+    samples: int = 1  # as of `Proposal`
 
 
-Late = Callable[[int], bool]
-"""Whether the time is over after so many evaluations."""
+Late = Callable[[int], bool]  # whether the time is over after so many evaluations
 
 OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
 """Called after every evaluation, ranking included, with its record, u, and the (usable) evaluation."""
@@ -78,47 +51,29 @@ OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What a search claims. Only `verify` turns a claim into a finding (docs/design.md, "Verification").
+    """What a search claims. Only `verify` turns a claim into a finding (docs/design.md, "Verification")."""
 
-    Attributes:
-        best_u: (d,) float32, the configuration that the search found; the start if nothing could be evaluated.
-        best_objective: mean objective of `best_u` in its new renders; its raw one if it had none. NaN if nothing
-            could be evaluated, or one of these renders was not finite.
-        claimed_objective: the raw objective in the search, biased upwards.
-        success_rate: fraction of its new renders (else of its one raw render) that the model got wrong.
-        ending: FOUND if that fraction is at least a half; else why the search stopped. INTERRUPTED takes precedence.
-        stopped: why the loop stopped, whatever it had found.
-        history: one record per evaluation of the search itself.
-        ranking: one record per new render of a candidate.
-        renders: pictures in all, those that differences took and those of the ranking included.
-        gradients: how many of them included a gradient.
-        non_finite_objectives: evaluations whose objective was NaN or infinite.
-        non_finite_elements: gradient elements that were set to zero, over all evaluations.
-        seconds: total time, evaluations included.
-        agreement: cosines of gradients with those before them, in their order: what noise and the way between left of
-            them; none for gradients of zero.
-        counts: what the policy had to do about gradients and steps.
-        distribution: what the policy found beside `best_u`, if it is one that finds a distribution.
-        failures: what the policy knows of different failures, if it is one that looks for them.
-    """
-
-    best_u: Tensor
+    best_u: Tensor  # (d,) float32, what the search found; the start if nothing could be evaluated
     best_objective: float
-    claimed_objective: float
-    success_rate: float
-    ending: Ending
-    stopped: Ending
-    history: tuple[StepRecord, ...]
-    ranking: tuple[StepRecord, ...]
-    renders: int
-    gradients: int
-    non_finite_objectives: int
-    non_finite_elements: int
-    seconds: float
+    """Mean objective of `best_u` in its new renders; its raw one if it had none. NaN if nothing could be evaluated, or
+    one of these renders was not finite."""
+    claimed_objective: float  # the raw objective in the search, biased upwards
+    success_rate: float  # share of its new renders (else of its one raw render) that the model got wrong
+    ending: Ending  # INTERRUPTED; FOUND if that share is at least a half; else why the search stopped
+    stopped: Ending  # why the loop stopped, whatever it had found
+    history: tuple[StepRecord, ...]  # one record per evaluation of the search itself
+    ranking: tuple[StepRecord, ...]  # one record per new render of a candidate
+    renders: int  # pictures in all, those that differences took and those of the ranking included
+    gradients: int  # how many of them included a gradient
+    non_finite_objectives: int  # evaluations whose objective was NaN or infinite
+    non_finite_elements: int  # gradient elements that were set to zero, over all evaluations
+    seconds: float  # total time, evaluations included
     agreement: tuple[float, ...] = ()
-    counts: Counts = NO_COUNTS
-    distribution: Distribution | None = None
-    failures: Failures | None = None
+    """Cosines of gradients with those before them, in their order: what noise and the way between left of them; none
+    for gradients of zero."""
+    counts: Counts = field(default_factory=Counts)  # what the policy had to do about gradients and steps
+    distribution: Distribution | None = None  # what the policy found beside `best_u`, if it finds a distribution
+    failures: Failures | None = None  # what the policy knows of different failures, if it looks for them
 
 
 def planned_renders(steps: int, candidates: int = 4, repeats: int = 2, close: int = 0) -> int:
@@ -146,7 +101,7 @@ def search(
 
     1. Until `steps` renders are spent: the policy proposes as many configurations as do not wait for each other; they
        are checked against the domain and evaluated, each with a new seed (docs/design.md, "The search"); the policy is
-       told. An evaluation costs `Proposal.cost` renders at most. What cannot be paid is not asked for (`affordable`).
+       told. An evaluation costs `Proposal.cost` renders at most. What cannot be paid is not asked for.
     2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seeds that are
        the same for all, without gradient. The best by these renders is what the search found (see `candidates`). With
        `candidates=0`, for an objective without noise, the raw best is what it found. Where evaluations draw conditions
@@ -195,7 +150,30 @@ def search(
                 _rank(log, steps, repeats, close)
     except KeyboardInterrupt:
         stopped = Ending.INTERRUPTED
-    return _result(log, stopped, time.perf_counter() - begun)
+    chosen = best(log.pool) if log.pool else Candidate(domain.start, math.nan, False)
+    claimed = chosen.rate >= 0.5 and stopped is not Ending.INTERRUPTED
+    started, state = (log.policy, log.state) if log.state is not None else (None, None)
+    if started is not None and log.told:  # a batch that was cut
+        state = started.update(state, log.told)
+    return SearchResult(
+        best_u=chosen.u,
+        best_objective=chosen.believed if math.isfinite(chosen.believed) else math.nan,
+        claimed_objective=chosen.objective,
+        success_rate=chosen.rate,
+        ending=Ending.FOUND if claimed else stopped,
+        stopped=stopped,
+        history=tuple(record for record in log.records if record.phase == "search"),
+        ranking=tuple(record for record in log.records if record.phase == "ranking"),
+        renders=log.renders,
+        gradients=log.gradients,
+        non_finite_objectives=log.non_finite,
+        non_finite_elements=sum(record.non_finite for record in log.records),
+        seconds=time.perf_counter() - begun,
+        agreement=tuple(log.agreement),
+        counts=Counts() if started is None else started.counts(state),
+        distribution=None if started is None else started.distribution(state),
+        failures=None if started is None else started.failures(state),
+    )
 
 
 @dataclass(eq=False)
@@ -230,7 +208,7 @@ class _Log:
         for proposal, query, raw in zip(proposals, queries, self.evaluate(queries), strict=True):
             seconds = time.perf_counter() - begun
             _check_evaluation(raw, proposal, self.domain)
-            evaluation = usable(raw)
+            evaluation = raw.usable()
             self.gradients += bool(proposal.gradient)
             self.renders += raw.cost
             if not evaluation.finite:
@@ -284,8 +262,8 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
         for proposal in proposals:
             _check_inside(proposal, log.domain, name)
             if left > 0:
-                copied = replace(proposal, u=proposal.u.clone())  # a policy may write into its own later
-                batch.append(affordable(copied, log.domain, left))
+                own = replace(proposal, u=proposal.u.clone())  # a policy may write into its own later
+                batch.append(own.affordable(log.domain, left))
                 left -= batch[-1].cost(log.domain)
         log.state, log.told, over, first = state, [], False, len(log.records)
         evaluations = log.evaluated(batch, range(first, first + len(batch)), "search")
@@ -318,33 +296,6 @@ def _rank(log: _Log, first: int, repeats: int, close: int) -> None:
             for evaluation in islice(evaluations, len(indices)):
                 candidate = candidate.seen_again(evaluation.objective, evaluation.success)
                 log.pool = (*log.pool[:place], candidate, *pool[place + 1 :])
-
-
-def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
-    chosen = best(log.pool) if log.pool else Candidate(log.domain.start, math.nan, False)
-    claimed = chosen.rate >= 0.5 and stopped is not Ending.INTERRUPTED
-    policy, state = (log.policy, log.state) if log.state is not None else (None, None)
-    if policy is not None and log.told:  # a batch that was cut
-        state = policy.update(state, log.told)
-    return SearchResult(
-        best_u=chosen.u,
-        best_objective=chosen.believed if math.isfinite(chosen.believed) else math.nan,
-        claimed_objective=chosen.objective,
-        success_rate=chosen.rate,
-        ending=Ending.FOUND if claimed else stopped,
-        stopped=stopped,
-        history=tuple(r for r in log.records if r.phase == "search"),
-        ranking=tuple(r for r in log.records if r.phase == "ranking"),
-        renders=log.renders,
-        gradients=log.gradients,
-        non_finite_objectives=log.non_finite,
-        non_finite_elements=sum(r.non_finite for r in log.records),
-        seconds=seconds,
-        agreement=tuple(log.agreement),
-        counts=NO_COUNTS if policy is None else policy.counts(state),
-        distribution=None if policy is None else policy.distribution(state),
-        failures=None if policy is None else policy.failures(state),
-    )
 
 
 def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:

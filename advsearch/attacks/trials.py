@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, product
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -86,19 +87,12 @@ def wilson(share: Any, n: Any) -> tuple[Any, Any]:
 
 @dataclass(frozen=True)
 class Trials:
-    """How often something happened in independent trials.
+    """How often something happened in independent trials."""
 
-    Attributes:
-        successes: from 0 to `trials`.
-        trials: at least 1.
-        spp: samples per pixel of every trial.
-        confidence: of the Clopper-Pearson interval; larger than 95 % where trials might have ended at several looks.
-    """
-
-    successes: int
-    trials: int
-    spp: int
-    confidence: float = CONFIDENCE
+    successes: int  # from 0 to `trials`
+    trials: int  # at least 1
+    spp: int  # samples per pixel of every trial
+    confidence: float = CONFIDENCE  # of the interval; larger than 95 % where trials might have ended at several looks
 
     @property
     def rate(self) -> float:
@@ -221,8 +215,7 @@ LADDER = (4, 16, 64, 256)  # sample counts to try; each quarters the variance of
 LOOKS = (4, 8)  # renders of a configuration at each sample count after which one looks at them
 MOST_LOOKED_AT = 20  # renders of a sample count of which no more are made to look at, though there be more trials
 
-MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]
-"""(spp, seeds) -> margins in logits, one of each render."""
+MarginsOf = Callable[[int, Sequence[int]], Sequence[float]]  # (spp, seeds) -> margins in logits, one of each render
 
 
 def margins_of(evaluate: Evaluate, kind: str, u: Tensor, *, keep: int = 0, drawn: bool = False) -> MarginsOf:
@@ -307,9 +300,9 @@ def choose_spp(
         below: list[float] = []
         for spp, here in zip(ladder, values, strict=False):
             half_width = _quantile(len(here), len(looks)) * _deviation(here) / math.sqrt(len(here))
-            drift = _mean(here) - _mean(below) if below else math.nan
+            drift = fmean(here) - fmean(below) if below else math.nan
             settled = bool(below) and _settled(here, below, len(looks), trials)
-            table.append(Rung(name, spp, _mean(here), half_width, drift, settled))
+            table.append(Rung(name, spp, fmean(here), half_width, drift, settled))
             below = here
         renders, reached = renders + sum(map(len, values)), max(reached, len(values) - 1)
         if not table[-1].settled:
@@ -338,8 +331,8 @@ def _climbed(
 
 def _settled(here: Sequence[float], below: Sequence[float], looks: int, trials: int) -> bool:
     """Whether the margins of a rung and of the one below show that more samples change nothing; see `choose_spp`."""
-    mean, count, one = _mean(here), min(len(here), len(below)), _deviation(here)
-    ahead, ahead_error = 2.0 * mean - _mean(below), math.hypot(2.0 * one, _deviation(below)) / math.sqrt(count)
+    mean, count, one = fmean(here), min(len(here), len(below)), _deviation(here)
+    ahead, ahead_error = 2.0 * mean - fmean(below), math.hypot(2.0 * one, _deviation(below)) / math.sqrt(count)
     side, quantile = math.copysign(1.0, mean), _quantile(count, looks)
     error = one / math.sqrt(count) if count == trials else one
     far = side * mean > quantile * error and side * ahead > quantile * ahead_error
@@ -357,8 +350,8 @@ def _may_settle(values: Sequence[list[float]], ladder: Sequence[int], level: int
         return True
     if values[level] and min(values[level]) <= 0.0 <= max(values[level]):
         return False
-    best, mean = values[known[-1]], _mean(values[known[-1]])
-    largest = abs(mean) + abs(mean - _mean(values[known[-2]])) + _deviation(best) / math.sqrt(len(best))
+    best, mean = values[known[-1]], fmean(values[known[-1]])
+    largest = abs(mean) + abs(mean - fmean(values[known[-2]])) + _deviation(best) / math.sqrt(len(best))
     below, here = (
         _deviation(values[rung]) if values[rung] else _deviation(best) * math.sqrt(ladder[known[-1]] / ladder[rung])
         for rung in (level - 1, level)
@@ -376,12 +369,8 @@ def most_samples(configurations: int, ladder: Sequence[int] = LADDER, trials: in
     return configurations * looks_of(trials)[-1] * sum(ladder) if len(ladder) > 1 else 0
 
 
-def _mean(values: Sequence[float]) -> float:
-    return math.fsum(values) / len(values)
-
-
 def _deviation(values: Sequence[float]) -> float:
-    mean = _mean(values)
+    mean = fmean(values)
     return math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
 
 
@@ -391,11 +380,7 @@ def _quantile(count: int, looks: int) -> float:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How many samples a pixel trials over many conditions need (docs/design.md).
-#
-# What is verified there is a rate: the share of conditions under which the model is wrong. A condition whose margin is
-# near zero comes out one way or the other by noise, however many samples there are, and as often one way as the other.
-# So only what noise does to the margins on average counts, and the share of conditions which that carries over zero.
+# How many samples a pixel trials over many conditions need: of a rate (docs/design.md).
 
 CONDITIONS = 30  # conditions under which each configuration is rendered at each sample count
 MOVED = 0.05  # share of the conditions that more samples may carry over zero

@@ -22,29 +22,25 @@ class Ending(Enum):
     """Why a search or a run stopped. The value is what JSON holds; `explanation` is one sentence for a person. What a
     search ends with is a claim; only `verify` makes it a finding (docs/design.md, "Verification")."""
 
-    FOUND = "found"
-    BUDGET_SPENT = "budget spent"
-    NOT_VERIFIED = "not verified"
-    ALREADY_WRONG = "already wrong"
-    STALLED = "stalled"
-    NON_FINITE = "non-finite objective"
-    INTERRUPTED = "interrupted"
+    explanation: str
+    FOUND = "found", "A configuration inside the budget makes the model wrong."
+    BUDGET_SPENT = "budget spent", "All renders were spent and no configuration made the model wrong."
+    NOT_VERIFIED = (
+        "not verified",
+        "The search claimed a wrong prediction, but it did not hold in the trials with fresh seeds.",
+    )
+    ALREADY_WRONG = (
+        "already wrong",
+        "The model is wrong on the clean configuration already, so there is nothing to attack.",
+    )
+    STALLED = "stalled", "The policy had nothing more to propose before the budget was spent."
+    NON_FINITE = "non-finite objective", "The objective was NaN or infinite several times in a row."
+    INTERRUPTED = "interrupted", "The search was interrupted; the best configuration so far was kept."
 
-    @property
-    def explanation(self) -> str:
-        """One sentence that says what happened."""
-        return _EXPLANATIONS[self]
-
-
-_EXPLANATIONS = {
-    Ending.FOUND: "A configuration inside the budget makes the model wrong.",
-    Ending.BUDGET_SPENT: "All renders were spent and no configuration made the model wrong.",
-    Ending.NOT_VERIFIED: "The search claimed a wrong prediction, but it did not hold in the trials with fresh seeds.",
-    Ending.ALREADY_WRONG: "The model is wrong on the clean configuration already, so there is nothing to attack.",
-    Ending.STALLED: "The policy had nothing more to propose before the budget was spent.",
-    Ending.NON_FINITE: "The objective was NaN or infinite several times in a row.",
-    Ending.INTERRUPTED: "The search was interrupted; the best configuration so far was kept.",
-}
+    def __new__(cls, value: str, explanation: str) -> Ending:
+        ending = object.__new__(cls)
+        ending._value_, ending.explanation = value, explanation
+        return ending
 
 
 PASS_PERCENT = 95  # of trials in which a claim must hold, and the clean control be right: 14 of 14, 19 of 20
@@ -73,18 +69,14 @@ the fewest that can verify anything (54 to 100 %); 5 of 5 begin at 48 %."""
 
 @dataclass(frozen=True)
 class Rule:
-    """When a claim counts as verified.
+    """When a claim counts as verified."""
 
-    Attributes:
-        percent: of the trials in which it must hold.
-        control: a success counts only where the clean configuration is right, which it has to be in as many per cent.
-        conditional: the percentage is one of the trials in which the clean configuration is right, and it has to be
-            right in half of all: for conditions that vary, and may be hard ones by themselves.
-    """
-
-    percent: int = PASS_PERCENT
+    percent: int = PASS_PERCENT  # of the trials in which it must hold
     control: bool = True
+    """A success counts only where the clean configuration is right, which it has to be in as many per cent."""
     conditional: bool = False
+    """The percentage is one of the trials in which the clean configuration is right, and it has to be right in half of
+    all: for conditions that vary, and may be hard ones by themselves."""
 
     def needed(self, trials: int, *, early: bool = False) -> int:
         """Return how many of `trials` must succeed: the percentage, rounded up, and never under `fewest`. Of
@@ -144,34 +136,21 @@ recognised better than the clean one with the same seed."""
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """What the trials say.
+    """What the trials say."""
 
-    Attributes:
-        ending: the run's ending; FOUND only if `Rule.verdict` says so.
-        reason: one sentence with the numbers behind it.
-        u: (d,) the configuration verified, projected into its budget again.
-        clean: right predictions of the control group.
-        adversarial: successes, by `Rule.succeeded`.
-        clean_trials, adversarial_trials: every single trial, in the order of their seeds; of curtailed ones the second
-            group is the shorter.
-        renders: renders spent here.
-        stopped: why there are no more trials: "asked for" (as many as were), "decided" (the verdict stands).
-        outcomes: of each trial of the second group, whether it is a success; None where it does not count, as under
-            its conditions the clean configuration is wrong.
-        begin: the number of the first trial.
-    """
-
-    ending: Ending
-    reason: str
-    u: Tensor
-    clean: Trials
-    adversarial: Trials
-    clean_trials: tuple[Judgement, ...]
-    adversarial_trials: tuple[Judgement, ...]
-    renders: int
-    stopped: str
+    ending: Ending  # the run's; FOUND only if `Rule.verdict` says so
+    reason: str  # one sentence with the numbers behind it
+    u: Tensor  # (d,) the configuration verified, projected into its budget again
+    clean: Trials  # right predictions of the control group
+    adversarial: Trials  # successes, by `Rule.succeeded`
+    clean_trials: tuple[Judgement, ...]  # every single trial, in the order of their seeds
+    adversarial_trials: tuple[Judgement, ...]  # likewise; of curtailed ones this group is the shorter
+    renders: int  # spent here
+    stopped: str  # why there are no more trials: "asked for" (as many as were), "decided" (the verdict stands)
     outcomes: tuple[bool | None, ...]
-    begin: int = 0
+    """Of each trial of the second group, whether it is a success; None where it does not count, as under its conditions
+    the clean configuration is wrong."""
+    begin: int = 0  # the number of the first trial
 
     @property
     def counting(self) -> tuple[Judgement, ...]:

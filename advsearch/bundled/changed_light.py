@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from advsearch.scene.assets import EnvironmentAsset, Floats
+from advsearch.scene.assets import EnvironmentAsset
 
 WARM = (1.06, 0.18, -1.25)
 """Logarithms of what light of 2,700 K has of red, green and blue, beside light of 6,500 K; their mean is about zero."""
@@ -22,7 +22,15 @@ def varied(environment: EnvironmentAsset, rng: np.random.Generator) -> Environme
     mean = float(radiance.mean()) + 1e-6
     radiance = mean * (radiance / mean) ** np.float32(rng.uniform(0.8, 1.15))
     if rng.random() < 0.5:
-        radiance = radiance + mean * _soft_light(radiance.shape[:2], rng)
+        # a broad lobe from a random direction above the horizon, in units of the map's mean
+        height, width = radiance.shape[:2]
+        theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
+        phi = (np.arange(width) + 0.5)[None, :] * 2.0 * math.pi / width
+        tilt, turn = rng.uniform(0.1, 1.3), rng.uniform(0.0, 2.0 * math.pi)
+        cosine = np.cos(theta) * math.cos(tilt) + np.sin(theta) * math.sin(tilt) * np.cos(phi - turn)
+        sharpness = rng.uniform(20.0, 150.0)
+        lobe = rng.uniform(2.0, 12.0) * np.exp(sharpness * (cosine - 1.0))
+        radiance = radiance + mean * lobe[..., None].astype(np.float32)
     return replace(environment, radiance=np.ascontiguousarray(radiance, dtype=np.float32))
 
 
@@ -36,15 +44,3 @@ def white_light_changed(environment: EnvironmentAsset, rng: np.random.Generator)
         return environment
     factors = np.exp(rng.uniform(*OF_WARM) * np.asarray(WARM)).astype(np.float32)
     return replace(environment, radiance=np.ascontiguousarray(environment.radiance * factors))
-
-
-def _soft_light(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
-    """A broad lobe from a random direction above the horizon, in units of the map's mean; (H, W, 1)."""
-    height, width = shape
-    theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
-    phi = (np.arange(width) + 0.5)[None, :] * 2.0 * math.pi / width
-    tilt, turn = rng.uniform(0.1, 1.3), rng.uniform(0.0, 2.0 * math.pi)
-    cosine = np.cos(theta) * math.cos(tilt) + np.sin(theta) * math.sin(tilt) * np.cos(phi - turn)
-    sharpness = rng.uniform(20.0, 150.0)
-    lobe = rng.uniform(2.0, 12.0) * np.exp(sharpness * (cosine - 1.0))
-    return np.asarray(lobe[..., None], dtype=np.float32)

@@ -35,7 +35,6 @@ OR_A_FILE = ("--object", "--environment", "--model")
     ),
 )
 def completion(args: argparse.Namespace) -> int:
-    """Print the script."""
     try:
         import shtab  # an optional extra
     except ImportError as error:

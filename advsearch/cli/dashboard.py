@@ -47,7 +47,6 @@ SEEN = (
     examples=("dashboard", "dashboard mug-sweep-001 mug-sweep-002", "dashboard --host 0.0.0.0"),
 )
 def dashboard(args: argparse.Namespace) -> int:
-    """Serve pages of runs."""
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
     runs = [find_run(name, checked=False) for name in args.runs]  # the list says what is wrong with one

@@ -60,7 +60,6 @@ class Component:
 
 @command(output.add_flags)
 def doctor(args: argparse.Namespace) -> int:
-    """Say what works."""
     print("advsearch: trying every part, a first render among them; that takes some seconds", file=sys.stderr)
     parts = diagnose()
     good = all(part.status in (OK, WARNING) for part in parts)
@@ -109,14 +108,14 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
         done = subprocess.run(
             command, capture_output=True, text=True, timeout=SECONDS_ALLOWED, check=False, cwd=OWN_FOLDER
         )
-        printed, status = done.stdout, done.returncode
+        printed, status, good = done.stdout, done.returncode, done.returncode == 0
         telling = [line.strip() for line in done.stderr.splitlines() if "ERROR" in line or "Error" in line]
         how = f"signal {signal.Signals(-status).name}" if status < 0 else f"status {status}"
         ending = f"the trial ended with {how}" + (f" ({telling[0][:120]})" if telling else "") if status else ""
     except subprocess.TimeoutExpired as expired:
         partial = expired.stdout
         printed = partial.decode("utf-8", "replace") if isinstance(partial, bytes) else partial or ""
-        status, ending = None, f"the trial took longer than {SECONDS_ALLOWED} s"
+        good, ending = False, f"the trial took longer than {SECONDS_ALLOWED} s"
     tried = {}
     for line in printed.splitlines():
         try:
@@ -124,7 +123,7 @@ def run_probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
             tried[outcome["name"]] = (bool(outcome["ok"]), str(outcome["detail"]))
         except (ValueError, KeyError, TypeError):  # a library's own words
             continue
-    return {**tried, "": (status == 0, ending)}
+    return {**tried, "": (good, ending)}
 
 
 def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
@@ -160,7 +159,6 @@ def other_packages(requirements: Sequence[str] | None = None) -> Component:
 
 
 def installed_version(name: str) -> str | None:
-    """The version of an installed package, or None."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -236,7 +234,6 @@ def disk(folder: Path) -> Component:
 
 
 def check_hardware() -> Component:
-    """Cores and memory."""
     cores = threads.cores()
     memory = 0  # where the system does not tell
     with suppress(AttributeError, ValueError, OSError):

@@ -19,7 +19,6 @@ NOISE = 0.08  # four standard deviations of the brightness of those pixels at 4 
 
 
 def imported(name: str) -> str:
-    """Import a package, with the native code that it loads."""
     importlib.import_module(name)
     return "imported"
 

@@ -159,7 +159,6 @@ FORMAT = f"csv, json or parquet: the rows as a table; {_KNOWN} (default: by the 
     ),
 )  # fmt: skip
 def export(args: argparse.Namespace) -> int:
-    """Export a run."""
     out = None if args.out is None else Path(args.out)
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     endings = {writer.ending or format: format for format, writer in WRITERS.items()}

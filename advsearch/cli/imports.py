@@ -29,7 +29,6 @@ Understood = tuple[dict[str, Any], list[str]]  # what is understood of a file, a
     examples=("import mug.obj", "import room.glb --json", "import room.glb --out room.png", "import box.xml --json"),
 )
 def file(args: argparse.Namespace) -> int:
-    """Say what is understood of a file."""
     out = None if args.out is None else Path(args.out)
     if out is not None and out.suffix.lower() != ".png":
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
@@ -52,7 +51,7 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
     materials = {name: len(faces) for name, faces in whole.mesh.materials.items()}
     width, height = whole.base_color.shape[1::-1]
     up = None if whole.up is None else whole.up.axis
-    clips, moved = ([], []) if rig is None else (list(rig.clips), list(rig.defaults))
+    clips, moved = (list(rig.clips), list(rig.defaults)) if rig is not None else ([], [])
     joints = [name.removesuffix(".x") for name in moved if name.endswith(".x")]
     targets = [name.removesuffix(".weight") for name in moved if name.endswith(".weight")]
     features = {"what it lets light through": whole.opacity, "its normal map": whole.normal_map}
@@ -132,7 +131,6 @@ def _describe(parser: argparse.ArgumentParser) -> None:
     output.add_flags,
 )
 def threedb(args: argparse.Namespace) -> int:
-    """Make a run of what 3DB wrote."""
     from advsearch.questions.sweep.result import import_threedb  # takes seconds
 
     path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)

@@ -6,7 +6,6 @@ Exit status: 0 the command did its work, 1 a bug, 2 bad input, 3 a check that fe
 from __future__ import annotations
 
 import argparse
-import importlib
 import re
 import shutil
 import signal
@@ -23,7 +22,7 @@ from advsearch.cli import output
 from advsearch.cli.output import BAD_INPUT, INTERRUPTED, OK, at_work, end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
-from advsearch.registry import allow_code, made_question, made_questions, nothing_allowed, rooms
+from advsearch.registry import allow_code, imported, made_question, made_questions, nothing_allowed, rooms
 from advsearch.registry import help_of as help_of_question
 
 if TYPE_CHECKING:
@@ -46,22 +45,14 @@ def argument(*names: str, **options: Any) -> Argument:
 
 @dataclass(frozen=True)
 class PlainCommand:
-    """A command that asks no question.
+    """A command that asks no question."""
 
-    Attributes:
-        run: does what the arguments say, and returns the exit status.
-        arguments: what adds them, in the order in which the help shows them.
-        more: what its help says after what it does.
-        examples: lines of a shell, without `advsearch`.
-    """
-
-    run: Callable[[argparse.Namespace], int]
-    arguments: tuple[Argument, ...]
-    more: str = ""
-    examples: tuple[str, ...] = ()
+    run: Callable[[argparse.Namespace], int]  # does what the arguments say, and returns the exit status
+    arguments: tuple[Argument, ...]  # what adds them, in the order in which the help shows them
+    more: str = ""  # what its help says after what it does
+    examples: tuple[str, ...] = ()  # lines of a shell, without `advsearch`
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add its arguments to a parser."""
         for add in self.arguments:
             add(parser)
 
@@ -102,7 +93,6 @@ class QuestionCommand:
         return metavar, missing, more, several
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add a flag for each of the settings, and those that commands share."""
         # late, so that --help answers at once
         from advsearch.cli.flags import add_settings
         from advsearch.config import CONFIGS
@@ -120,8 +110,7 @@ class QuestionCommand:
         """Ask what the arguments say. Raises InputError where what it is about is missing."""
         named, (metavar, missing, _, _) = getattr(args, self.about, None), self.place
         if self.listed and named == "list":
-            module, _, function = self.listed.partition(":")
-            lines = getattr(importlib.import_module(module), function)()
+            lines = imported(self.listed)()
             listed = [{"name": name, "title": text} for name, text in lines.items()]
             return output.say(args.json, {f"{self.name}s": listed}, output.aligned([*lines.items()]))
         if metavar and named in (None, []):
@@ -202,16 +191,14 @@ COMMANDS = {name: place for group in GROUPS.values() for name, place in group.it
 def command_named(name: str) -> Any:
     """Return the `QuestionCommand` or `PlainCommand` of a name."""
     if COMMANDS[name]:
-        place, _, attribute = COMMANDS[name].partition(" ")[0].partition(":")
-        return getattr(importlib.import_module(f"advsearch.cli.{place}"), attribute)
+        return imported(f"advsearch.cli.{COMMANDS[name].partition(' ')[0]}")
     if made := made_question(name):
         same = ("short", "about", "expected", "brought", "listed", "more", "examples")
         return QuestionCommand(name, **{attribute: getattr(made, attribute) for attribute in same})
-    return importlib.import_module(f"advsearch.questions.{name}").COMMAND
+    return imported(f"advsearch.questions.{name}:COMMAND")
 
 
 def help_of(name: str) -> str:
-    """Return what a command does, in a line."""
     return COMMANDS[name].partition(" ")[2] or help_of_question(name)
 
 
@@ -227,7 +214,6 @@ class Parser(argparse.ArgumentParser):
     """argparse, but what is wrong with the arguments is an `InputError`."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise the message as an `InputError` that says where help is."""
         raise InputError(f"{message}; see {self.prog} --help")
 
 

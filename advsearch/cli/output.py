@@ -51,13 +51,11 @@ class Screen:
         self._needed = needed
 
     def write(self, text: str) -> int:
-        """Write a text; errors as for `output_errors`."""
         with output_errors() if self._needed else suppress(OSError):
             self.stream.write(escaped(text, self.stream.encoding or "utf-8"))
         return len(text)
 
     def flush(self) -> None:
-        """Write out what is held back; errors as for `write`."""
         with output_errors() if self._needed else suppress(OSError):
             self.stream.flush()
 
@@ -157,7 +155,8 @@ def finish(result: Result, text: Callable[[Any], str], *, as_json: bool) -> int:
         print_json(result)
     else:
         print(text(result) + go_on_text(result))
-    return INTERRUPTED if getattr(result, "ending", None) == "interrupted" else OK
+    stopped = getattr(result, "ending", None) == "interrupted"
+    return INTERRUPTED if stopped else OK
 
 
 def go_on_text(result: Result) -> str:

@@ -29,7 +29,6 @@ from advsearch.settings.values import put
     output.add_quiet_flags,
 )
 def run(args: argparse.Namespace) -> int:
-    """Do what a file describes."""
     changes = changes_in(args.change)
     if args.run is not None:
         changes["run"] = args.run
@@ -100,7 +99,6 @@ MOST_NAMES = 4  # controls of a run that the table names
 
 @command(argument("folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)"), output.add_flags)
 def runs(args: argparse.Namespace) -> int:
-    """List the runs in a folder."""
     folder = HOME if args.folder is None else Path(args.folder)
     if args.folder is not None and not os.path.isdir(folder):
         raise InputError(f"{folder}: expected a folder with runs in it, got no such folder")

@@ -6,7 +6,6 @@ And what `advsearch render` says: a picture of a scene, or a sheet of views arou
 from __future__ import annotations
 
 import argparse
-import importlib
 import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +20,7 @@ from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
-from advsearch.registry import allow_named, there
+from advsearch.registry import allow_named, imported, there
 from advsearch.report.wording import SEEN, count, interval_text, seen_cells, seen_text, things_rows
 from advsearch.runs.directory import IMAGES, find_run
 from advsearch.runs.listing import Listed, listed_run
@@ -49,7 +48,6 @@ def _set_usage(parser: argparse.ArgumentParser) -> None:
     output.add_flags,
 )
 def show(args: argparse.Namespace) -> int:
-    """Show a run, or what has a name."""
     if args.picture and (args.json or len(args.what) > 1):
         raise InputError("--picture: draws the pictures of one run, after its text; give one run, and leave --json out")
     match args.what:
@@ -242,7 +240,6 @@ def _drawing() -> tuple[Callable[[Path], None] | None, str]:
 
 
 def render_text(result: RenderResult) -> str:
-    """Return what was written, and the model's predictions view by view."""
     height, width = result.size
     lines = [f"{result.out}: {width} x {height} pixels"]
     lines += [f"{result.answered}: with the predictions drawn in"] if result.answered else []
@@ -302,8 +299,7 @@ def list_names(kind: str) -> dict[str, str]:
 
 
 def _registry(kind: str) -> Any:
-    module, _, attribute = REGISTRIES[kind].partition(":")
-    registry = getattr(importlib.import_module(module), attribute)
+    registry = imported(REGISTRIES[kind])
     return registry() if callable(registry) else registry
 
 
@@ -319,7 +315,6 @@ def first_doc_line(entry: Any) -> str:
     argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all"), output.add_flags
 )
 def list_all(args: argparse.Namespace) -> int:
-    """Print the names of one kind, or of all."""
     kinds = [kind for kind in REGISTRIES if kind != CASES] if args.kind == "all" else [args.kind]
     with at_work(as_json=True, quiet=False):
         names = {kind: list_names(kind) for kind in kinds}
@@ -347,7 +342,8 @@ def labels(args: argparse.Namespace) -> int:
         if "labels" in args and args.labels is not None:
             names = read_labels(args.labels)
         else:
-            allow_named({"model": (model := getattr(args, "model", "reference"))})
+            model = getattr(args, "model", "reference")
+            allow_named({"model": model})
             loaded = load_model(model)
             if not loaded.named:
                 what = f"model {loaded.name} has {loaded.classes} classes without names"
@@ -355,9 +351,9 @@ def labels(args: argparse.Namespace) -> int:
             names = loaded.labels
         like = range(len(names)) if args.word is None else [index for index, _ in matching_labels(args.word, names)]
         asked = args.word is not None and names_nothing(args.word)
-        found = {index: names[index] for index in like if asked or not names_nothing(names[index])}
-    if not found:
+        classes = {index: names[index] for index in like if asked or not names_nothing(names[index])}
+    if not classes:
         raise InputError(f"none of the {len(names)} labels is like {args.word!r}; leave the word out to see all")
-    listed = [{"index": index, "label": name} for index, name in found.items()]
-    text = output.aligned([[f"#{index}", name] for index, name in found.items()])
+    listed = [{"index": index, "label": name} for index, name in classes.items()]
+    text = output.aligned([[f"#{index}", name] for index, name in classes.items()])
     return output.say(args.json, {"command": "labels", "word": args.word, "labels": listed}, text)

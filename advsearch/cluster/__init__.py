@@ -13,8 +13,7 @@ from typing import Any, Protocol
 from advsearch.files import JsonObject
 from advsearch.registry import allowed_code
 
-Call = Callable[[Sequence[Any]], Any]
-"""What carries out one batch; a pure function of it."""
+Call = Callable[[Sequence[Any]], Any]  # what carries out one batch; a pure function of it
 
 
 @dataclass(frozen=True)
@@ -107,11 +106,9 @@ class SchedulerGoneError(Exception):
 class Pool(Protocol):
     """Workers, each of which does one call at a time."""
 
-    where: str
-    """What it is, in a user's words."""
+    where: str  # what it is, in a user's words
 
-    link: str
-    """Of a page that shows the workers; empty where there is none."""
+    link: str  # of a page that shows the workers; empty where there is none
 
     @property
     def ended(self) -> SimpleQueue[Future[Any]]:

@@ -5,7 +5,6 @@ files in it and below of the kinds that a scene consists of."""
 from __future__ import annotations
 
 import hashlib
-import importlib
 import json
 import os
 import pickle
@@ -28,7 +27,7 @@ from advsearch import threads  # before torch: it sets how OpenMP waits
 from advsearch.cluster import Call, Work
 from advsearch.errors import AdvsearchError, EnvironmentSetupError, InputError, StorageError
 from advsearch.files import split_paths
-from advsearch.registry import allow_code
+from advsearch.registry import allow_code, imported
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 
 _CPU_INFO = Path("/proc/cpuinfo")
@@ -39,13 +38,11 @@ MachineInfo = dict[str, str]
 
 @cache
 def this_machine() -> MachineInfo:
-    """Return the processor, libLLVM, and versions of packages."""
     llvm = ".".join(map(str, ensure_llvm().version))
     return {"processor": processor(), "LLVM": llvm, **{name: _version(name) for name in PACKAGES}}
 
 
 def machine_name(machine: MachineInfo) -> str:
-    """Return a short name of a machine by what it is."""
     return hashlib.sha256(json.dumps(machine, sort_keys=True).encode()).hexdigest()[:8]
 
 
@@ -100,7 +97,6 @@ class MissingError(Exception):
 
 
 def read_files(work: Work) -> Files:
-    """Read the files that the settings of a work name."""
     contents: dict[str, bytes] = {}
     for value in map(work.settings.get, work.files):
         for part in _split(value) if isinstance(value, str) else ():
@@ -163,15 +159,11 @@ _one_at_a_time = threading.Lock()
 
 
 class Ready(NamedTuple):
-    """A worker is ready."""
-
     machine: MachineInfo
     seconds: float
 
 
 class Carried(NamedTuple):
-    """A batch was carried out."""
-
     value: Any
     seconds: float
 
@@ -237,8 +229,7 @@ def own_folder() -> Path:
 def _call_of(key: str) -> Call:
     work = _known[key]
     threads.configure(work.threads)
-    module, _, name = work.function.partition(":")
-    make: Callable[[Any], Call] = getattr(importlib.import_module(module), name)
+    make: Callable[[Any], Call] = imported(work.function)
     return make(work.settings)
 
 

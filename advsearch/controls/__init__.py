@@ -11,8 +11,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 from typing import Any
 
-from advsearch.controls.base import Budget, Choice, Control, Group, Moved, Parameter, check_prepared
-from advsearch.controls.numbers import NumberControl
+from advsearch.controls.base import Budget, Choice, Control, Group, Moved, NumberControl, Parameter, check_prepared
 from advsearch.controls.space import Space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import by_key
@@ -24,8 +23,7 @@ ORDER = (
     "occlusion contents background haze lens sensor corruption mitsuba"
 ).split()
 """In which lists have controls; one that is not named comes last."""
-SHARED = ("base", "ranges", "numbers", "space", "values", "corruption_filters", "material_patterns")
-"""Modules of this folder that are no control."""
+SHARED = ("base", "ranges", "space", "corruption_filters")  # modules of this folder that are no control
 
 
 _kinds = {module.name for module in iter_modules(__path__)} - {*SHARED}
@@ -67,10 +65,6 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     control = CONTROLS[kind]
     if parameter is not None:
         options.setdefault(parameter, _default_range(control, parameter))
-    known = [one.name for one in control.choices] + [one.name for one in control.declared(options)]
-    for setting in options:
-        if setting not in known:
-            raise UnknownNameError(f"setting of control {kind}", setting, known)
     if name != kind:
         options["name"] = name
     return control(**options)
@@ -85,8 +79,7 @@ def unknown_control(kind: str, hint: str = "", instances: Iterable[str] = ()) ->
 
 def names_of(asked: str, given: Mapping[str, object]) -> tuple[str, str]:
     """Return the kind and the name of the instance that `make_control` makes of a name and settings."""
-    kind, name, _ = _read_name(asked, dict(given))
-    return kind, name
+    return _read_name(asked, dict(given))[:2]
 
 
 def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | None]:
@@ -131,11 +124,8 @@ def _default_range(control: type[Control], parameter: str) -> object:
 
 
 def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
-    """Return the settings of each control, with ranges of Mitsuba's names under one.
-
-    Raises:
-        InputError: one has something else than settings.
-    """
+    """Return the settings of each control, with ranges of Mitsuba's names under one. Raises InputError: one has
+    something else than settings."""
     by_name: dict[str, Mapping[str, object]] = {}
     for name, given in by_key(asked).items():
         if given is not None and not isinstance(given, Mapping):
@@ -166,38 +156,43 @@ def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them into something that can be searched.
-
-    Raises:
-        InputError: no control, two of one name, one that the scene cannot take, or nothing that varies.
-    """
+    """Let controls prepare a scene, bind them to it and compose them into something that can be searched. Raises
+    InputError: no control, two of one name, one that the scene cannot take, or nothing that varies."""
     if not controls:
         raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
     space = compose(controls, scene)
     if not len(space.start):
-        names = ", ".join(control.name for control in controls)
+        first, names = space.controls[0], ", ".join(control.name for control in controls)
+        example = f"{first.name}:KEY=[0.2, 0.8]"
+        if first.parameters:
+            one = next((one for one in first.own if one.search is not None), first.own[0])
+            low, high = one.search or (one.low, one.high)
+            example = f"{first.name}={{{one.name}: [{low:g}, {high:g}]}}"
         raise InputError(
             f"`controls` {names}: every parameter is fixed, so there is nothing to search; give one a range, "
-            f"such as {_suggestion(space.controls[0])}"
+            f"such as {example}"
         )
     return space
 
 
 def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them; none, or only fixed ones, will do.
-
-    Raises:
-        InputError: two controls of one name, one that the scene cannot take, or one that leaves out what the scene was
-            asked to have.
-    """
+    """Let controls prepare a scene, bind them to it and compose them; none, or only fixed ones, will do. Raises
+    InputError: two controls of one name, one that the scene cannot take, or one that leaves out what the scene was
+    asked to have."""
     names = [control.name for control in controls]
     if len(set(names)) != len(names):
         raise InputError(
             f"controls: every instance needs a name of its own, got {', '.join(names)}; write KIND:NAME, such as "
             f"light:key,light:fill"
         )
+    for control in controls:
+        if control.name != control.kind and control.name in scene.around:
+            able = ", ".join(kind for kind in CONTROLS if CONTROLS[kind].of_a_mesh)
+            raise InputError(
+                f"`controls` {control.kind}:{control.name}: {control.kind} can't be given to another mesh than the "
+                f"object; {able} can, as in pose:{control.name}"
+            )
     described, moved = scene, list[Moved]()
-    check_about(controls, scene)
     for control in controls:
         prepared = control.prepare(scene)
         moved += check_prepared(control.name, scene, prepared)
@@ -212,27 +207,6 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
     lit_by = [str(one.used) for one in moved if one.parameter == ENVIRONMENT]
     lit_by += [scene.environment_spec] if scene.environment_spec != described.environment_spec else []
     return Space(bound, scene, tuple(moved), lit_by[0] if lit_by else None)
-
-
-def check_about(controls: Sequence[Control], scene: SceneDescription) -> None:
-    """Refuse the name of a mesh for a control that is not about one mesh or only about the object. Raises InputError
-    where one has it."""
-    for control in controls:
-        if control.name != control.kind and control.name in scene.around:
-            able = ", ".join(kind for kind in CONTROLS if CONTROLS[kind].of_a_mesh)
-            raise InputError(
-                f"`controls` {control.kind}:{control.name}: {control.kind} can't be given to another mesh than the "
-                f"object; {able} can, as in pose:{control.name}"
-            )
-
-
-def _suggestion(control: Control) -> str:
-    """A range that could be given, for a message."""
-    if not control.parameters:
-        return f"{control.name}:KEY=[0.2, 0.8]"
-    one = next((one for one in control.own if one.search is not None), control.own[0])
-    low, high = one.search or (one.low, one.high)
-    return f"{control.name}={{{one.name}: [{low:g}, {high:g}]}}"
 
 
 def __getattr__(name: str) -> Any:

@@ -8,15 +8,15 @@ value are the hexcone model of Smith (Color gamut transform pairs, SIGGRAPH 1978
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Fixed, Number, OneOf, Parameter, Value, measure, number
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named, number
+from advsearch.controls.ranges import Fixed, Number
 from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -27,60 +27,51 @@ COLOR = "backdrop.color"  # the scene input: (3,) display-linear values in [0, 1
 WHAT = ("colour", "environment")
 NUMBERS = ("hue", "saturation", "value")
 
-
 _image = partial(number, ("image",))
 
 
-class BackgroundControl(NumberControl):
-    """A plain colour behind the object."""
+class BackgroundControl(Control):
+    """A plain colour behind the object; the environment keeps lighting it."""
 
     kind = "background"
     amount = "what"
-    summary = "A plain colour behind the object; the environment keeps lighting it."
     parameters = (
-        Parameter(
-            "what", (), "name", 0, len(WHAT) - 1, "colour",
-            "What is behind the object: the colour, or the environment as ever.", options=WHAT, estimators=(),
-        ),
+        named("what", WHAT, "colour", "What is behind the object: the colour, or the environment as ever."),
         _image("hue", "degrees", 0.0, 360.0, 0.0, "Hue: 0 is red, 120 green, 240 blue.", (0.0, 360.0), periodic=True),
         _image("saturation", "1", 0.0, 1.0, 0.0, "Saturation: 0 is grey.", (0.0, 1.0)),
         _image("value", "sRGB", 0.0, 1.0, 0.5, "The largest of red, green and blue: 0 is black.", (0.0, 1.0)),
-    )  # fmt: skip
-    choices = (
-        Choice(
-            "ground", "hide", "Whether the ground plane stays in the picture: keep or hide.", options=("keep", "hide")
-        ),
     )
+    choices = (Choice("ground", "hide", "Whether the ground plane stays in the picture: keep or hide.",
+                      options=("keep", "hide")),)  # fmt: skip
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
         # a list for `what` alone leaves the colour to be searched
-        self.asked = any(not isinstance(self.specs.get(one, Fixed(0.0)), Fixed) for one in NUMBERS)
+        self.asked = any(not isinstance(self.specs.get(name, Fixed(0.0)), Fixed) for name in NUMBERS)
         if self.specs.get("what") == Fixed("environment"):
             raise InputError(
                 f"{self.name}.what: environment alone leaves nothing to search; use what=[colour, environment], or "
                 f"leave the control out"
             )
 
-    def default(self, parameter: Parameter) -> Number:
-        spec = self.specs.get("what")
-        as_ever = parameter.name == "what" and isinstance(spec, OneOf) and "environment" in spec.values
-        return "environment" if as_ever else super().default(parameter)
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        as_ever = parameter.name == "what" and "environment" in self.allowed("what")
+        return replace(parameter, default="environment") if as_ever else parameter
 
     def unchanged(self, parameter: Parameter) -> Number:
-        return "environment" if parameter.name == "what" else super().unchanged(parameter)
+        return "environment" if parameter.name == "what" else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        scene = dataclasses.replace(scene, backdrop=True)
+        scene = replace(scene, backdrop=True)
         return on_its_ground(scene.with_values(ground__size=0.0)) if self.chosen["ground"] == "hide" else scene
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if WHAT[int(values["what"])] == "environment":
             return {}
-        return {COLOR: srgb_to_linear(hsv_to_rgb(values["hue"], values["saturation"], values["value"]))}
+        return {COLOR: srgb_to_linear(hsv_to_rgb(*(values[name] for name in NUMBERS)))}
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        color = hsv_to_rgb(values["hue"], values["saturation"], values["value"])
+        color = hsv_to_rgb(*(values[name] for name in NUMBERS))
         return {name: measure(value, "sRGB") for name, value in zip(CHANNELS, color, strict=True)}
 
 

@@ -1,235 +1,53 @@
 """What a control is: a named family of scene parameters that may vary, and their map from the unit box.
 
 A control declares its parameters as data. Bound to a scene it has a slice of u and the map from it to scene inputs, in
-torch. Most controls subclass `numbers.NumberControl` (docs/controls/writing.md).
+torch. Most are a handful of named numbers, each fixed, a range, or a list: they declare the parameters, and say in
+`scene_inputs` what they do to the scene (docs/controls/writing.md):
+
+    class Exposure(Control):
+        kind = "exposure"
+        summary = "How bright the picture is."
+        parameters = (Parameter("stops", (), "stops", -10, 10, 0.0, "Over the metered exposure.", search=(-2, 2)),)
+
+        def scene_inputs(self, values, so_far):
+            return {"camera.exposure": values["stops"]}
 """
 
 from __future__ import annotations
 
 import copy
-import math
-from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import groupby, pairwise
+from dataclasses import dataclass, replace
+from itertools import groupby
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from advsearch.controls.ranges import DrawnRange, Range, is_number, read_drawn
+from advsearch.controls.ranges import Fixed, Number, OneOf, Range, Slot, Spec, is_number, plain, read, same, shown
 from advsearch.copies import copied, hand_copies, is_ours
 from advsearch.described import Value as Value
 from advsearch.described import rounded
-from advsearch.distributions import CHOICES, DISTRIBUTION, WEIGHTS, as_setting
+from advsearch.distributions import as_setting
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription, check_one_environment
 from advsearch.scene.gradients import WHOLE_RANGE as WHOLE_RANGE
 from advsearch.scene.gradients import Budget as Budget
 from advsearch.scene.gradients import Group as Group
 from advsearch.scene.parts import MeshPart, PluginPart
-from advsearch.scene.settings import SETTINGS
+from advsearch.scene.settings import CHANNELS, SETTINGS
 from advsearch.scene.settings import Parameter as Parameter
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# ---------------------------------------------------------------------------------------------------------------------
-# What a parameter was set to: fixed, a range to search, or a list of values to choose from (docs/controls/README.md).
-#
-#     pose: {yaw: [0, 360], pitch: 10, scale: {choices: [0.8, 1.0, 1.2]}}
-#
-# Two numbers in a list are a range; three or more, or names, are a choice. `{range: [low, high]}` and `{choices:
-# [...]}` say which. Values that are drawn may have weights, or a distribution (`advsearch.controls.ranges`).
-#
+LARGEST_EPSILON = 1e6  # no distance from where a control starts is larger, in whichever norm
+
 # Where a control leaves out a value of the clean scene that was asked for, the two contradict each other, and that is
 # refused. Where it leaves out only a default, the clean scene has the nearest value that the control allows, and that
 # is said: a `Moved`.
-
-Number = float | str
-
-LARGEST_EPSILON = 1e6  # no distance from where a control starts is larger, in whichever norm
-
-
-@dataclass(frozen=True)
-class Fixed:
-    """One value, not searched."""
-
-    value: Number
-
-
-@dataclass(frozen=True)
-class OneOf:
-    """One of a few values: numbers or names."""
-
-    values: tuple[Number, ...]
-
-
-Spec = Fixed | Range | OneOf
-
-
-def plain(given: object) -> object:
-    """Return numbers and arrays of numpy and torch, also in a list, as Python's, and distributions as settings."""
-    given = as_setting(given)
-    if isinstance(given, (list, tuple)):
-        return type(given)(map(plain, given))
-    return given.tolist() if hasattr(given, "tolist") and hasattr(given, "dtype") else given
-
-
-def read(where: str, parameter: Parameter, given: object) -> Spec:
-    """Return the setting of a parameter from what was given for it.
-
-    Args:
-        where: how messages name it, e.g. "pose.yaw".
-        parameter: says what is allowed.
-        given: a number or a name, [low, high], a list of values, {"range": [low, high]}, {"choices": [...]}, perhaps
-            with "weights", or a distribution.
-
-    Raises:
-        InputError: not such a form, or a value outside the parameter's range.
-    """
-    if isinstance(given, Mapping) and DISTRIBUTION in given and not parameter.options:
-        return read_drawn(where, parameter, given)
-    if isinstance(given, Mapping) and set(given) == {"range"} and _is_list(given["range"]) and len(given["range"]) == 2:
-        given = given["range"]
-    if isinstance(given, Mapping):
-        if not {CHOICES} <= set(given) <= {CHOICES, WEIGHTS} or not _is_list(given[CHOICES]) or not given[CHOICES]:
-            raise InputError(
-                f"{where}: expected {{range: [low, high]}}, {{choices: [value, ...]}}, {{choices: [value, ...], "
-                "weights: [number, ...]}}"
-                + ("" if parameter.options else " or {distribution: NAME, ...}")
-                + f", got {dict(given)!r}"
-            )
-        choices = _choices(where, [_value(where, parameter, value) for value in given[CHOICES]])
-        return _weighted(where, choices, given[WEIGHTS]) if WEIGHTS in given else choices
-    if not _is_list(given):
-        return Fixed(_value(where, parameter, given))
-    values = [_value(where, parameter, one) for one in given]  # type: ignore[attr-defined]
-    if values and (parameter.options or len(values) > 2):
-        return _choices(where, values)
-    if len(values) != 2:
-        raise InputError(f"{where}: expected a value, [low, high] or a list of values, got {given!r}")
-    low, high = (float(value) for value in values)
-    if low == high:
-        raise InputError(f"{where}: the range [{low:g}, {high:g}] has no size; write {low:g} to fix the value")
-    if low > high:
-        mend = f"write [{high:g}, {low:g}]"
-        if parameter.periodic and low - high < TURN:
-            ends = (low - TURN, high) if low - TURN >= parameter.low else (low, high + TURN)
-            mend = (
-                f"write [{ends[0]:g}, {ends[1]:g}] for the {TURN - low + high:g} degrees from {low:g} through "
-                f"{0 if ends[0] <= 0 else TURN:g} to {high:g}, or [{high:g}, {low:g}] for the other {low - high:g}"
-            )
-        raise InputError(f"{where}: the range [{low:g}, {high:g}] is reversed; {mend}")
-    if parameter.log and low <= 0.0:
-        raise InputError(f"{where}: expected a range over 0 (it is searched on a logarithmic scale), got {low:g}")
-    return Range(low, high)
-
-
-def _choices(where: str, values: Sequence[Number]) -> OneOf:
-    """The values, of which none may come twice: it would be drawn twice as often."""
-    twice = [value for value, count in Counter(values).items() if count > 1]
-    if twice:
-        raise InputError(f"{where}: expected different choices, got {shown(twice[0])} twice; leave one of them out")
-    return OneOf(tuple(values))
-
-
-MOST_SHARES = 1000  # equal shares of probability that weights are rounded to, at most
-
-
-def _weighted(where: str, choice: OneOf, weights: object) -> OneOf:
-    """A choice that has each value as often as its weight says, so that equal shares of u draw it so."""
-    values = choice.values
-    given = list(weights) if isinstance(weights, (list, tuple)) else []
-    numbers = [one for one in given if is_number(one) and one >= 0.0]
-    if not len(numbers) == len(given) == len(values) or not sum(numbers):
-        raise InputError(
-            f"{where}: expected a weight of at least 0 for each of {len(values)} values, and one over 0, got "
-            f"{weights!r:.80}"
-        )
-    shares = [one / sum(numbers) for one in numbers]
-    exact = (n for n in range(1, MOST_SHARES) if all(abs(n * one - round(n * one)) < 1e-9 for one in shares))
-    count = next(exact, MOST_SHARES)
-    ends = [0, *(round(count * sum(shares[: number + 1])) for number in range(len(shares)))]
-    counts = [high - low for low, high in pairwise(ends)]
-    lost = [value for value, number, one in zip(values, counts, shares, strict=True) if one and not number]
-    if lost:
-        raise InputError(f"{where}: {shown(lost[0])} has less than a {MOST_SHARES}th of the weight; leave it out")
-    return OneOf(tuple(value for value, number in zip(values, counts, strict=True) for _ in range(number)))
-
-
-def by_distribution(spec: Spec) -> bool:
-    """Return whether a spec says how likely each value is."""
-    return isinstance(spec, DrawnRange) or (isinstance(spec, OneOf) and len({*spec.values}) < len(spec.values))
-
-
-def _is_list(given: object) -> bool:
-    return isinstance(given, Sequence) and not isinstance(given, (str, bytes))
-
-
-def _value(where: str, parameter: Parameter, given: object) -> Number:
-    if parameter.options:
-        if not isinstance(given, str):
-            raise InputError(f"{where}: expected one of {', '.join(parameter.options)}, got {given!r}")
-        if given not in parameter.options:
-            raise UnknownNameError(where, given, parameter.options)
-        return given
-    if parameter.unit == "name" and isinstance(given, str) and given.strip():
-        return given
-    if isinstance(given, bool) or not isinstance(given, (int, float)):
-        raise InputError(f"{where}: expected a number in {parameter.unit}, got {given!r}")
-    if not (is_number(given) and parameter.low <= given <= parameter.high):
-        raise InputError(
-            f"{where}: expected a number from {parameter.low:g} to {parameter.high:g} ({parameter.unit}), "
-            f"got {shown(given)}"
-        )
-    return float(given)
-
-
-def is_whole(given: object, low: int, high: int) -> TypeGuard[float]:
-    """Return whether it is a whole number from `low` to `high`."""
-    return is_number(given) and low <= given <= high and given == int(given)
-
-
-def in_words(spec: Spec) -> str:
-    """Say what a parameter is set to: ``10``, ``from 5 to 30``, ``one of noon, kitchen``."""
-    if isinstance(spec, Range):
-        return f"from {spec.low:g} to {spec.high:g}"
-    values = (spec.value,) if isinstance(spec, Fixed) else dict.fromkeys(spec.values)
-    written = ", ".join(map(shown, values))
-    return written if isinstance(spec, Fixed) else f"one of {written}"
-
-
-def to_value(spec: Range, log: bool, u: Tensor) -> Tensor:
-    """Map coordinates in [0, 1] to values of a range; differentiable."""
-    if isinstance(spec, DrawnRange):
-        return spec.at(u)
-    if log:
-        return torch.exp(torch.lerp(torch.full_like(u, math.log(spec.low)), torch.full_like(u, math.log(spec.high)), u))
-    return spec.low + (spec.high - spec.low) * u
-
-
-def to_unit(spec: Range, log: bool, value: float) -> float:
-    """Map a value to its coordinate, clipped to [0, 1]."""
-    if isinstance(spec, DrawnRange):
-        return spec.coordinate(value)
-    if log:
-        value = max(value, 1e-30)
-        share = (math.log(value) - math.log(spec.low)) / (math.log(spec.high) - math.log(spec.low))
-    else:
-        share = (value - spec.low) / (spec.high - spec.low)
-    return min(1.0, max(0.0, share))
-
-
-def option_index(count: int, u: Tensor) -> int:
-    """Return which of `count` options a coordinate chooses: equal shares of [0, 1]."""
-    return min(count - 1, max(0, int(float(u.detach()) * count)))
-
-
-TURN = 360.0
-CLOSE = 1e-6  # relative difference up to which two values are the same
 
 
 @dataclass(frozen=True)
@@ -247,9 +65,16 @@ class Moved:
 
 def sentences(moved: Sequence[Moved]) -> list[str]:
     """Return what is said of the values that had to move: one sentence a control."""
+
+    def instead(value: Moved) -> str:
+        unit = "" if value.unit in ("1", "name") or isinstance(value.used, str) else f" {value.unit}"
+        short = [end if isinstance(end, str) else rounded(end) for end in (value.used, value.scene)]
+        used, scene = short if short[0] != short[1] else (shown(value.used), shown(value.scene))
+        return f"{value.parameter} {used}{unit} instead of {scene}"
+
     return [
-        f"The clean scene has {' and '.join(map(_instead, several))}, which the control {control} leaves out."
-        for control, several in groupby(moved, key=lambda one: one.control)
+        f"The clean scene has {' and '.join(map(instead, several))}, which the control {control} leaves out."
+        for control, several in groupby(moved, key=lambda value: value.control)
     ]
 
 
@@ -277,58 +102,13 @@ def check_prepared(control: str, before: SceneDescription, after: SceneDescripti
         yield Moved(control, name, SETTINGS[name].unit, scene, value)
 
 
-def check_start(
-    control: str, parameter: str, allowed: str, setting: str, scene: SceneDescription, wanted: Number
-) -> None:
-    """Raise InputError where a value `wanted` of a control's parameter, which is outside what is `allowed` (in words)
-    and so cannot be that of the clean scene, was asked for in the scene's `setting` that says the same."""
-    if setting in scene.given:
-        asked = f"`environment={scene.environment_spec}`"
-        if setting != ENVIRONMENT:
-            asked = f"`set` {setting}={shown(scene.number(setting))}"
-        raise InputError(
-            f"{asked} and `controls` {control} contradict each other: {control}.{parameter} is {allowed}, which leaves "
-            f"{shown(wanted)} out; change one of the two, or leave one out"
-        )
+HANDED = (
+    "prepare", "bind", "inputs", "picture", "describe", "artifacts", "printed", "numbers", "files", "scene_inputs",
+    "on_picture", "measured", "kept_pictures", "kept_files",
+)  # fmt: skip
+"""Methods of controls to which those of another package are handed copies of tensors."""
 
-
-def same(one: Number, other: Number, *, turns: bool = False) -> bool:
-    """Whether two values are the same, up to a rounding error and, of an angle that turns, up to whole turns."""
-    if isinstance(one, str) or isinstance(other, str):
-        return one == other
-    return apart(one, other, turns=turns) <= CLOSE * max(1.0, abs(one), abs(other))
-
-
-def apart(one: float, other: float, *, turns: bool = False) -> float:
-    """How far two numbers are from each other; angles that turn, the nearer way around."""
-    return abs(math.remainder(one - other, TURN) if turns else one - other)
-
-
-def nearest(value: float, low: float, high: float, *, turns: bool = False) -> float:
-    """Return the value in a range that is nearest to one, of an angle that turns the nearest way around."""
-    if turns:
-        value = low + (value - low) % TURN
-        if value > high and value - high > low + TURN - value:
-            value = low
-    return min(max(value, low), high)
-
-
-def shown(value: Number) -> str:
-    """A value as it is written."""
-    if isinstance(value, int) and not is_number(value):
-        return f"a whole number of {value.bit_length()} bits"
-    return value if isinstance(value, str) else f"{value:g}"
-
-
-def _instead(one: Moved) -> str:
-    unit = "" if one.unit in ("1", "name") or isinstance(one.used, str) else f" {one.unit}"
-    short = [value if isinstance(value, str) else rounded(value) for value in (one.used, one.scene)]
-    used, scene = short if short[0] != short[1] else (shown(one.used), shown(one.scene))
-    return f"{one.parameter} {used}{unit} instead of {scene}"
-
-
-NOTHING: Mapping[str, Tensor] = MappingProxyType({})
-"""No scene inputs yet."""
+NOTHING: Mapping[str, Tensor] = MappingProxyType({})  # no scene inputs yet
 
 
 @dataclass(frozen=True)
@@ -360,24 +140,31 @@ class Choice:
     most: float | None = None
 
     def check(self, control: str, given: object) -> None:
-        """Check what was chosen in an instance of a control; None is fine where it is the default.
-
-        Raises:
-            InputError: it cannot be chosen.
-        """
+        """Check what was chosen in an instance of a control; None is fine where it is the default. Raises InputError:
+        it cannot be chosen."""
         allowed, fits = "", True
         if self.options:
             allowed, fits = f"one of {', '.join(self.options)}", given in self.options
         elif self.whole is not None:
-            allowed, fits = "a whole number from {} to {}".format(*self.whole), is_whole(given, *self.whole)
+            low, high = self.whole
+            allowed = f"a whole number from {low} to {high}"
+            fits = is_number(given) and low <= given <= high and given == int(given)
         elif self.most is not None:
             allowed, fits = f"a number over 0 and up to {self.most:g}", is_number(given) and 0.0 < given <= self.most
         if not fits and not (given is None and self.default is None):
             raise InputError(f"{control}.{self.name}: expected {allowed}, got {given!r}")
 
 
-class Control(ABC):
+Values = Mapping[str, Tensor]
+"""A configuration: parameter name to a float32 tensor of the parameter's shape; of a discrete choice, its number."""
+
+
+class Control:
     """A family of scene parameters. `bind` returns a copy with a scene, which has a slice of u and maps it to inputs.
+
+    It is made of named numbers and choices. Once one parameter is given a range or a list, only those given so are
+    searched; otherwise each parameter is searched over its own `search` range, if it has one. Of a picture among the
+    parameters, the numbers are not said one by one.
 
     Args:
         name: the instance's name; the kind unless given.
@@ -385,10 +172,12 @@ class Control(ABC):
 
     Attributes:
         kind: the word for it on the command line.
-        summary: one sentence.
+        summary: one sentence; of a class that says none, the first of its docstring.
         parameters: what may vary.
         choices: what may be chosen.
         of_a_mesh: it is about one mesh, and may be about another than the object: the name of that is then `KIND:MESH`.
+        amount: the parameter whose value in the scene as it was described means that the rest of the control does not
+            show: the power of a lamp, say. None where the scene has all parameters of itself.
         own: the parameters of this instance: `declared` of its settings.
         chosen: what is chosen, by name; the default where nothing was said.
         specs: what parameters were set to, of those that were given.
@@ -396,10 +185,15 @@ class Control(ABC):
         scene: once bound, the scene that all controls of the space have prepared.
         start: once bound, (d,) float32 in [0, 1], the value that leaves the scene as it is.
         groups: once bound, the coordinates of the slice in order; their sizes add up to d.
+        slots: once bound, each parameter with what it is set to, in the order of its coordinates; none where its
+            coordinates are no parameters one by one.
         moved: once bound, values of the clean scene that the start has not, because the control leaves them out.
         refines: the scene inputs that it takes from the controls before it, and may change (a patch on a texture).
         on_top: what it refines lies over what all other controls make of it, whatever the order in which they were
             asked for (a patch on any material).
+        exposure: seconds that the shutter is open, and that the rows of a picture are read in; see
+            `advsearch.scene.formation`.
+        flashes: how often a second it changes its light at most.
 
     Raises:
         UnknownNameError: no such parameter or choice.
@@ -411,17 +205,22 @@ class Control(ABC):
     parameters: ClassVar[tuple[Parameter, ...]]
     choices: ClassVar[tuple[Choice, ...]] = ()
     of_a_mesh: ClassVar[bool] = False
+    amount: ClassVar[str | None] = None
     on_top: bool = False
     name: str
     scene: SceneDescription
     start: Tensor
     groups: tuple[Group, ...]
+    slots: tuple[Slot, ...] = ()
     moved: tuple[Moved, ...] = ()
+    exposure: tuple[float, float] = (0.0, 0.0)
+    flashes: float = 0.0
 
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
-        asked = ("prepare", "bind", "inputs", "picture", "describe", "artifacts", "printed", "numbers", "files")
-        hand_copies(cls, **dict.fromkeys(asked, slice(None)))
+        hand_copies(cls, **dict.fromkeys(HANDED, slice(None)))
+        if "summary" not in vars(cls) and cls.__doc__:
+            cls.summary = " ".join(cls.__doc__.partition("\n\n")[0].split())
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         self.name = name or self.kind
@@ -446,20 +245,13 @@ class Control(ABC):
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance that is given some settings: those of the class, unless the scene or the
-        settings name them.
-
-        Args:
-            settings: names of what is given, perhaps with the values.
-        """
+        """Return the parameters of an instance that is given some settings, by name, perhaps with the values: those of
+        the class, unless the scene or the settings name them."""
         return cls.parameters
 
-    def check_choices(self) -> None:  # noqa: B027
-        """Check what the choices' own declarations do not say of `self.chosen`; by default nothing.
-
-        Raises:
-            InputError: a choice is out of range.
-        """
+    def check_choices(self) -> None:
+        """Check what the choices' own declarations do not say of `self.chosen`; by default nothing. Raises InputError:
+        a choice is out of range."""
 
     def settings(self) -> dict[str, object]:
         """Return what `make_control` needs to make an equal instance, as JSON values."""
@@ -471,15 +263,11 @@ class Control(ABC):
         return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
-        """Return that mesh in a scene.
-
-        Raises:
-            UnknownNameError: there is none of that name.
-        """
+        """Return that mesh in a scene. Raises UnknownNameError: there is none of that name."""
         mesh = self.mesh
         if mesh in scene.meshes:
             return scene.meshes[mesh]
-        if any(one.name == mesh for one in scene.parts if isinstance(one, PluginPart)):
+        if any(part.name == mesh for part in scene.parts if isinstance(part, PluginPart)):
             raise InputError(
                 f"`controls` {self.name}: {mesh} is around the object in a Mitsuba scene, and stays as it is; "
                 f"make it the object, or vary its numbers by Mitsuba's names, mitsuba:{mesh}.KEY=[low, high]"
@@ -518,14 +306,20 @@ class Control(ABC):
             raise InputError(f"{self.name}.form: expected one form, got {', '.join(asked)}")
         return asked[0] if asked else forms[0]
 
+    def allowed(self, parameter: str, *otherwise: Number) -> tuple[Number, ...]:
+        """Return the values, one by one, that a parameter was set to; others where nothing was said of it."""
+        spec = self.specs.get(parameter)
+        return spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else otherwise
+
+    def searches(self, parameter: str) -> bool:
+        """Return whether a parameter with a range of its own is among what is searched."""
+        return not isinstance(self.specs[parameter], Fixed) if parameter in self.specs else not self.asked
+
     # ---- in a scene -------------------------------------------------------------------------------------------------
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with whatever this control needs to be in it (a light, a medium); by default unchanged.
-
-        Raises:
-            InputError: the scene cannot take it.
-        """
+        Raises InputError: the scene cannot take it."""
         return scene
 
     def within(self, scene: SceneDescription) -> Self:
@@ -535,28 +329,87 @@ class Control(ABC):
         return there
 
     def bind(self, scene: SceneDescription) -> Self:
-        """Return a copy that is fit to a scene that all controls of the space have prepared.
-
-        Raises:
-            InputError: a setting of the control is impossible in this scene.
-        """
+        """Return a copy that is fit to a scene that all controls of the space have prepared. Raises InputError: a
+        setting of the control is impossible in this scene."""
         bound = self.within(scene)
         bound.fit()
         return bound
 
-    @abstractmethod
     def fit(self) -> None:
-        """Set `start` and `groups`, and `moved` where there is something to say, for `self.scene`.
+        """Set `start` and `groups`, and `moved` where there is something to say, for `self.scene`. Raises InputError: a
+        setting of the control is impossible in this scene."""
+        slots, begin = list[Slot](), 0
+        for slot in self.laid_out():
+            slots.append(replace(slot, begin=begin))
+            begin += slot.width
+        self.slots = tuple(slots)
+        self.moved = tuple(self.left_out(self.slots))
+        self.start = torch.tensor([share for slot in slots for share in slot.start()], dtype=torch.float32)
+        self.groups = tuple(self._group(slot) for slot in slots if slot.width)
+        ranges = [slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0) for slot in slots]
+        ends = torch.tensor([(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64).reshape(-1, 2)
+        self._low, self._span = ends.T.repeat_interleave(torch.tensor([slot.width for slot in slots]), dim=1)
 
-        Raises:
-            InputError: a setting of the control is impossible in this scene.
-        """
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        """Return a parameter as this scene has it: with its value in the unchanged scene as the default, the range that
+        is searched when nothing is said about it, and the unit, the shape and the estimators that it has there."""
+        value = self.scene.values.get(self.setting(parameter))
+        return parameter if value is None else replace(parameter, default=value)
 
-    exposure: tuple[float, float] = (0.0, 0.0)
-    """Seconds that the shutter is open, and that the rows of a picture are read in; see `advsearch.scene.formation`."""
+    def resting(self, name: str) -> Number:
+        """Return the value of a parameter in the unchanged scene."""
+        return next(self.in_scene(parameter).default for parameter in self.own if parameter.name == name)
 
-    flashes: float = 0.0
-    """How often a second it changes its light at most."""
+    def unchanged(self, parameter: Parameter) -> Number:
+        """Return what a parameter, as `in_scene` has it, is in the scene as it was described: its default, unless that
+        changes the scene."""
+        return parameter.default
+
+    def spec(self, parameter: Parameter) -> Spec:
+        """Return what a parameter, as `in_scene` has it, is set to."""
+        if parameter.name in self.specs:
+            return self.specs[parameter.name]
+        if self.asked or parameter.search is None:
+            return Fixed(parameter.default)
+        return OneOf(parameter.options) if parameter.options else Range(*parameter.search)
+
+    def budget_of(self, parameter: Parameter) -> Budget:
+        """Return how far a searched parameter may go: by default its whole range."""
+        return WHOLE_RANGE
+
+    def laid_out(self) -> Iterator[Slot]:
+        """Yield the parameters in the order of their coordinates."""
+        for parameter in map(self.in_scene, self.own):
+            yield Slot(parameter, self.spec(parameter))
+
+    def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:
+        """Yield the values of the clean scene that the start has not. Raises InputError: one of them was asked for."""
+        for slot in slots:
+            parameter, wanted, used = slot.parameter, self.unchanged(slot.parameter), slot.start_value()
+            if self.amount not in (None, parameter.name) or same(used, wanted, turns=slot.turns):
+                continue
+            setting, where = self.setting(parameter), f"{self.name}.{parameter.name}"
+            if setting in self.scene.given:
+                asked = f"`environment={self.scene.environment_spec}`"
+                if setting != ENVIRONMENT:
+                    asked = f"`set` {setting}={shown(self.scene.number(setting))}"
+                raise InputError(
+                    f"{asked} and `controls` {self.name} contradict each other: {where} is {slot.spec}, "
+                    f"which leaves {shown(wanted)} out; change one of the two, or leave one out"
+                )
+            if not isinstance(self.specs.get(parameter.name), Fixed):
+                unit = "name" if parameter.options else parameter.unit
+                yield Moved(self.name, setting if setting == ENVIRONMENT else where, unit, wanted, used)
+
+    def _group(self, slot: Slot) -> Group:
+        parameter, spec, setting = slot.parameter, slot.spec, self.setting(slot.parameter)
+        if isinstance(spec, OneOf):
+            return Group(parameter.name, slot.width, (), options=len(spec.values), setting=setting)
+        budget = self.budget_of(parameter)
+        if type(spec) is not Range and budget != WHOLE_RANGE:
+            raise InputError(f"{self.name}.{parameter.name}: it has a ball and no distribution; give it a range")
+        name, valid = parameter.name, parameter.estimators
+        return Group(name, slot.width, valid, budget, periodic=slot.periodic, setting=setting)
 
     def later(self, seconds: float) -> Control:
         """Return the bound control as it is so many seconds later, where it knows a time; else itself."""
@@ -572,7 +425,33 @@ class Control(ABC):
         """See the class; a plain attribute will do."""
         return frozenset()
 
-    @abstractmethod
+    # ---- at a configuration ------------------------------------------------------------------------------------------
+
+    def values(self, u: Tensor) -> dict[str, Tensor]:
+        """Return every parameter's value at a slice of u: float32 of the parameter's shape, or the number of an option.
+        Fixed ones are there too.
+        """
+        values: dict[str, Tensor] = {}
+        if not self.slots:
+            return values
+        every = self._low.to(u) + self._span.to(u) * u  # at once, but for what is searched on a logarithmic scale
+        for slot in self.slots:
+            parameter, spec, place = slot.parameter, slot.spec, slice(slot.begin, slot.begin + slot.size)
+            if isinstance(spec, Range):
+                mapped = parameter.log or type(spec) is not Range
+                value = spec.at(u[place], log=parameter.log) if mapped else every[place]
+                values[parameter.name] = value if parameter.shape else value.reshape(())
+                continue
+            chosen = spec.value if isinstance(spec, Fixed) else spec.at(u[slot.begin])
+            shape = (slot.size,) if parameter.shape and not isinstance(chosen, str) else ()
+            number = parameter.options.index(chosen) if isinstance(chosen, str) else chosen
+            values[parameter.name] = torch.full(shape, float(number), dtype=torch.float32, device=u.device)
+        return values
+
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return what the values do to the scene, by differentiable torch operations; see `inputs`."""
+        return {}
+
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         """Map a slice (d,) of u to named scene inputs, by differentiable torch operations, on the device of u.
 
@@ -580,21 +459,46 @@ class Control(ABC):
             u: (d,) in [0, 1].
             so_far: inputs of the controls before this one; only names in `refines` may be returned again.
         """
+        return self.scene_inputs(self.values(u), so_far)
+
+    def on_picture(self, values: Values, image: Tensor) -> Tensor:
+        """Return what the values make of the finished picture; see `picture`."""
+        return image
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
         """Change the finished picture (H, W, 3), display-referred sRGB in [0, 1]; differentiable in both arguments."""
-        return image
+        # many do nothing to the picture: their values are not worked out again
+        return image if type(self).on_picture is Control.on_picture else self.on_picture(self.values(u), image)
 
-    @abstractmethod
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+        """Return further values worth storing with a configuration, by name without the instance's."""
+        return {}
+
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         """Say a configuration in a few named values with units, small enough for one row of a table.
 
         It is a function of its arguments alone; arguments as for `inputs`.
         """
+        values = self.values(u.detach())
+        described: dict[str, Value] = {}
+        for slot in self.slots:
+            parameter, value, name = slot.parameter, values[slot.parameter.name], f"{self.name}.{slot.parameter.name}"
+            if isinstance(slot.spec, Fixed) or len(parameter.shape) > 1:
+                continue
+            if parameter.options:
+                described[name] = {"value": parameter.options[int(value)], "unit": "name"}
+            elif value.ndim == 0:
+                described[name] = measure(value, parameter.unit)
+            else:
+                described |= {f"{name}.{k}": measure(number, parameter.unit) for k, number in enumerate(value)}
+        return described | {f"{self.name}.{name}": value for name, value in self.measured(values, so_far).items()}
 
-    def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        """Return pictures worth keeping, by file stem: (h, w, 3) display-referred sRGB in [0, 1]; see `describe`."""
-        return {}
+    def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
+        """Return the numbers of the configuration by parameter, in its unit, (k,) or without dimensions, as
+        differentiable functions of u; names have none."""
+        values, declared = self.values(u), [slot.parameter for slot in self.slots]
+        named = [parameter.name for parameter in declared if not parameter.options and len(parameter.shape) < 2]
+        return {name: values[name] for name in named}
 
     def printed(self, u: Tensor) -> Tensor | None:
         """Return the searched colours that a printer would print, (h, w, 3) display-referred sRGB in [0, 1], as a
@@ -602,14 +506,24 @@ class Control(ABC):
         without."""
         return None
 
-    def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
-        """Return the numbers of the configuration by parameter, in its unit, (k,) or without dimensions, as
-        differentiable functions of u; names have none."""
+    def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return pictures worth keeping; see `artifacts`."""
+        return {}
+
+    def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
+        """Return pictures worth keeping, by file stem: (h, w, 3) display-referred sRGB in [0, 1]; see `describe`."""
+        return self.kept_pictures(self.values(u.detach()), so_far)
+
+    def kept_files(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, bytes]:
+        """Return other files worth keeping; see `files`."""
         return {}
 
     def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
         """Return other files worth keeping, by name with ending: a mesh as PLY, say; see `describe`."""
-        return {}
+        return self.kept_files(self.values(u.detach()), so_far)
+
+
+NumberControl = Control  # its name in packages that add controls
 
 
 def number(
@@ -620,12 +534,28 @@ def number(
     return Parameter(name, (), unit, low, high, default, text, periodic, False, search, log, estimators=estimators)
 
 
+def named(
+    name: str, options: tuple[str, ...], default: str, text: str, *, estimators: tuple[str, ...] = (),
+    moves_silhouettes: bool = False,
+) -> Parameter:  # fmt: skip
+    """Return a choice among names."""
+    return Parameter(
+        name, (), "name", 0.0, len(options) - 1.0, default, text, False, moves_silhouettes, options=options,
+        estimators=estimators,
+    )  # fmt: skip
+
+
+def color_of(values: Values) -> Tensor:
+    """Return the linear colour (3,) of the display-referred numbers red, green and blue."""
+    return srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))
+
+
 def measure(value: Tensor | float, unit: str) -> Value:
     """Return a number and its unit, as configurations are described."""
     return {"value": float(value), "unit": unit}
 
 
-def change_in_colour(name: str, change: Tensor) -> dict[str, Value]:
+def changed(name: str, change: Tensor) -> dict[str, Value]:
     """Say a change of searched colours, display-referred: the largest, and the root of the mean square."""
     root_mean_square = change.square().mean().sqrt()
     return {f"{name}.linf": measure(change.abs().max(), "sRGB"), f"{name}.rms": measure(root_mean_square, "sRGB")}

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Number, Parameter, Value
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Parameter, Value, Values
 from advsearch.controls.ranges import is_number
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import MeshRig
@@ -15,20 +15,19 @@ from advsearch.scene.people import PARAMETERS
 from advsearch.scene.rigged import TIME, part_of_a_rig
 
 
-class BodyControl(NumberControl):
+class BodyControl(Control):
     """What a person is like, how they stand or walk, and how a rigged file of your own moves."""
 
     kind = "body"
     of_a_mesh = True
-    summary = "What a person is like, how they stand or walk, and how a rigged file of your own moves."
     parameters = (*PARAMETERS, TIME)
     choices = (Choice("clip", None, "Name or number of the animation that `time` is of; by itself the first."),)
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        known = {one.name for one in cls.parameters}
-        named = (part_of_a_rig(name) for name in settings if name not in known)
-        return (*cls.parameters, *(one for one in named if one is not None))
+        known = {parameter.name for parameter in cls.parameters}
+        parts = (part_of_a_rig(name) for name in settings if name not in known)
+        return (*cls.parameters, *(part for part in parts if part is not None))
 
     @property
     def rig(self) -> MeshRig:
@@ -54,26 +53,26 @@ class BodyControl(NumberControl):
         return str(asked) if asked in clips else clips[number]
 
     def fit(self) -> None:
-        known = [one.name for one in self.rig.parameters]
+        known = [parameter.name for parameter in self.rig.parameters]
         for name in self.specs:
             if name not in known:
                 where = f"It stands in `controls` {self.name}."
                 raise UnknownNameError(f"parameter of {self.mesh}", name, known, where)
-        if not self._given and not any(map(self.search_range, self.parameters)):
+        if not self._given and not any(self.in_scene(parameter).search for parameter in self.parameters):
             example = next((name for name in known if name.endswith(".x")), known[0])
             raise InputError(
                 f"`controls` {self.name}: {self.mesh} has no animation to play; give ranges, as in "
                 f"{self.name}={{{example}: [-20, 20]}}"
             )
-        self.own = tuple(one for one in self.own if one.name in known)
+        self.own = tuple(parameter for parameter in self.own if parameter.name in known)
         self.clip  # noqa: B018 - refuses one that is not there
         super().fit()
 
-    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
-        return parameter.search if parameter.name in self.rig.defaults else None
-
-    def default(self, parameter: Parameter) -> Number:
-        return self.rig.defaults.get(parameter.name, super().default(parameter))
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        default = self.rig.defaults.get(parameter.name)
+        if default is None:
+            return replace(super().in_scene(parameter), search=None)
+        return replace(parameter, default=default)
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {f"{self.mesh}.offsets": self.rig.offsets(values, self.clip)}

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Fixed, Parameter, number
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Control, Parameter, Values, number
+from advsearch.controls.ranges import Fixed
 from advsearch.errors import InputError
 from advsearch.scene.assets import on_roads
 from advsearch.scene.camera_entries import PRESETS
@@ -27,23 +27,18 @@ from advsearch.scene.geometry import STEEPEST, affine, camera_to_world, framing_
 from advsearch.scene.settings import CAMERA, ORBIT, ORBIT_CAMERA, moving
 
 ROAD_USERS = (0.5, 4.0)  # metres above the road from which vehicles are seen: from a bumper to the roof of a lorry
+DISTORTION = {"k": "Radial", "p": "Tangential", "s": "Thin-prism"}
 SENSOR_WIDTH = 36.0  # width in millimetres of the full-frame sensor that a focal length refers to
-
-
-def _coefficient(name: str) -> Parameter:
-    what = {"k": "Radial", "p": "Tangential", "s": "Thin-prism"}[name[0]]
-    return moving(ORBIT, name, "1", -100.0, 100.0, 0.0, f"{what} distortion, as OpenCV has it.")
 
 
 SAME = (("fov", "focal_length"), ("elevation", "height"), ("distance", "sizes"))
 """Pairs of parameters that say the same thing."""
 
 
-class CameraControl(NumberControl):
+class CameraControl(Control):
     """An orbit around the object, the lens, and the exposure."""
 
     kind = "camera"
-    summary = "An orbit around the object, the lens, and the exposure."
     parameters = (
         *CAMERA[:-1],
         moving(ORBIT, "focal_length", "mm", 1.5, 2100.0, "as fov", "The same for a sensor 36 mm wide.", log=True),
@@ -52,7 +47,10 @@ class CameraControl(NumberControl):
         moving(ORBIT, "shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
         number(ORBIT, "aperture", "object sizes", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
         number(ORBIT, "focus", "metres", 1e-4, 1e5, "the object's middle", "Distance in focus.", log=True),
-        *map(_coefficient, COEFFICIENTS),
+        *(
+            moving(ORBIT, name, "1", -100.0, 100.0, 0.0, f"{DISTORTION[name[0]]} distortion, as OpenCV has it.")
+            for name in COEFFICIENTS
+        ),
         CAMERA[-1],
     )
 
@@ -75,62 +73,54 @@ class CameraControl(NumberControl):
         bent = [name for name in COEFFICIENTS if name in self.specs]
         if bent and scene.camera_model is None:
             scene = replace(scene, camera_model=pinhole(scene.number("camera.fov"), scene.aspect))
-        if scene.camera_model is None:
+        model = scene.camera_model
+        if model is None:
             return replace(scene, thin_lens=True) if wanted else scene
-        self._check_model(scene.camera_model, bent)
-        return scene
-
-    @property
-    def _shifted(self) -> bool:
-        return "shift_x" in self.specs or "shift_y" in self.specs
-
-    def _check_model(self, model: CameraModel, bent: list[str]) -> None:
-        """Refuse what the camera's model has not. Raises InputError where it was asked for."""
-        lacking = [name for name in bent if name not in OF_KIND[model.kind]]
-        if lacking:
-            has = ", ".join(OF_KIND[model.kind]) or "none"
-            raise InputError(
-                f"`controls` {self.name}: a {model.kind} lens has the coefficients {has}, not {lacking[0]}"
-            )
+        for name in bent:
+            if name not in OF_KIND[model.kind]:
+                has = ", ".join(OF_KIND[model.kind]) or "none"
+                raise InputError(f"`controls` {self.name}: a {model.kind} lens has the coefficients {has}, not {name}")
         own = ("fov", "focal_length") if model.name else ()
         shift = () if OF_KIND[model.kind] else ("shift_x", "shift_y")
         for name in (*own, *shift, "aperture", "focus"):
             if name in self.specs:
                 whose = f"the lens of `camera={model.name}`" if model.name else "a lens with distortion, or raindrops"
                 raise InputError(f"`controls` {self.name}: {name} is not supported with {whose}; leave one of them out")
+        return scene
+
+    @property
+    def _shifted(self) -> bool:
+        return "shift_x" in self.specs or "shift_y" in self.specs
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        return measured_in(parameter, self.scene.object.metres is not None)
-
-    def default(self, parameter: Parameter) -> float | str:
-        model = self.scene.camera_model
-        if parameter.name in COEFFICIENTS and model is not None:
-            return model.values[parameter.name]
-        if parameter.name in ("distance", "focus", "sizes"):
-            return fitted_distance(self._described()) * (1.0 if parameter.name == "sizes" else self.scene.metres)
-        if parameter.name == "height":
-            return float(camera_to_world(self._described())[2, 3]) * self.scene.metres
-        if parameter.name == "focal_length":
-            return SENSOR_WIDTH / 2.0 / math.tan(math.radians(self.scene.number("camera.fov")) / 2.0)
-        return super().default(parameter)
+        parameter, scene = measured_in(super().in_scene(parameter), self.scene.object.metres is not None), self.scene
+        name, default, search = parameter.name, parameter.default, parameter.search
+        if name in COEFFICIENTS and scene.camera_model is not None:
+            default = scene.camera_model.values[name]
+        elif name in ("distance", "focus", "sizes"):
+            described = self._described()
+            away = float(np.linalg.norm(camera_to_world(described)[:3, 3] - middle(described)))
+            default = away * (1.0 if name == "sizes" else scene.metres)
+        elif name == "height":
+            default = float(camera_to_world(self._described())[2, 3]) * scene.metres
+        elif name == "focal_length":
+            default = SENSOR_WIDTH / 2.0 / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
+        preset = PRESETS.get(scene.preset)
+        if preset is not None:
+            own = scene.number("camera.azimuth")
+            around = (0.0, 360.0) if preset.aside >= 180.0 else (own - preset.aside, own + preset.aside)
+            search = around if name == "azimuth" else preset.search.get(name)
+        elif on_roads(scene.object) and name == "elevation":
+            search = None
+        elif on_roads(scene.object) and name == "height":
+            search = ROAD_USERS[0], max(ROAD_USERS[1], float(default))
+        elif name == "distance" and search is not None:
+            search = search[0] * float(default), search[1] * float(default)
+        return replace(parameter, default=default, search=search)
 
     def setting(self, parameter: Parameter) -> str:
         same = {"focal_length": "camera.fov", "sizes": "camera.distance"}
         return same.get(parameter.name, super().setting(parameter))
-
-    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
-        preset = PRESETS.get(self.scene.preset)
-        if preset is not None:
-            own = self.scene.number("camera.azimuth")
-            around = (0.0, 360.0) if preset.aside >= 180.0 else (own - preset.aside, own + preset.aside)
-            return around if parameter.name == "azimuth" else preset.search.get(parameter.name)
-        if on_roads(self.scene.object) and parameter.name in ("elevation", "height"):
-            high = max(ROAD_USERS[1], float(self.default(parameter)))
-            return None if parameter.name == "elevation" else (ROAD_USERS[0], high)
-        if parameter.name == "distance" and parameter.search is not None:
-            fitted = fitted_distance(self._described()) * self.scene.metres
-            return parameter.search[0] * fitted, parameter.search[1] * fitted
-        return parameter.search
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         scene, fov = self.scene, values["fov"]
@@ -176,17 +166,13 @@ class CameraControl(NumberControl):
             return self.scene.with_values(camera__fov=_fov_of(torch.tensor(float(focal_length.value))).item())
         return self.scene
 
-    @property
-    def _keeps_height(self) -> bool:
-        """Whether the height above the ground says how high the camera is, and not the elevation."""
-        if {"elevation", "height"} & self.specs.keys():
-            return "height" in self.specs
-        searched = not self.asked and self.search_range(self.named("height")) is not None
-        return self.scene.values.get("camera.height") is not None or searched
-
     def _orbit(self, values: Values, distance: Tensor) -> Tensor:
         azimuth, elevation, roll = (torch.deg2rad(values[name]) for name in ("azimuth", "elevation", "roll"))
-        if self._keeps_height:
+        keeps_height = "height" in self.specs  # above the ground, so that the elevation follows
+        if not {"elevation", "height"} & self.specs.keys():
+            searched = any(slot.width for slot in self.slots if slot.parameter.name == "height")
+            keeps_height = self.scene.values.get("camera.height") is not None or searched
+        if keeps_height:
             above = values["height"] / self.scene.metres - float(middle(self.scene)[2])
             elevation = torch.asin((above / distance).clamp(-STEEPEST, STEEPEST))
         zero = torch.zeros_like(azimuth)
@@ -201,11 +187,6 @@ class CameraControl(NumberControl):
 def measured_in(parameter: Parameter, metres: bool) -> Parameter:
     """Return a parameter of the camera as it is around an object that has a size in metres, or has none."""
     return replace(parameter, unit="object sizes") if parameter.unit == "metres" and not metres else parameter
-
-
-def fitted_distance(scene: SceneDescription) -> float:
-    """Return the distance of the scene's own camera to what it looks at; object sizes."""
-    return float(np.linalg.norm(camera_to_world(scene)[:3, 3] - middle(scene)))
 
 
 def _fov_of(focal_length: Tensor) -> Tensor:

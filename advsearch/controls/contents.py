@@ -11,7 +11,7 @@ Proportions add up to one: the two that are free are cut off a stick of length o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -20,9 +20,8 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, Fixed, Number, OneOf, Parameter, Spec, Value, measure, number
-from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.ranges import Range
+from advsearch.controls.base import Control, Parameter, Value, Values, measure, number
+from advsearch.controls.ranges import Fixed, OneOf, Range, Spec
 from advsearch.controls.shadow import polygon
 from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, Ints, Material, Mesh, ObjectAsset
@@ -43,10 +42,8 @@ BRIM = 0.985  # a full vessel is filled to this share of its depth
 
 INGREDIENTS = ("water", "milk", "coffee")
 """In the order in which they are cut off the stick; what the first two leave is coffee."""
-REFLECTANCE = {"milk": (0.84, 0.80, 0.70), "coffee": (0.040, 0.016, 0.007)}
-"""Linear reflectance of a deep cup of each."""
-SCATTERING = {"milk": 1.0, "coffee": 0.10}
-"""How strongly each scatters, relative to milk."""
+REFLECTANCE = {"milk": (0.84, 0.80, 0.70), "coffee": (0.040, 0.016, 0.007)}  # linear reflectance of a deep cup of each
+SCATTERING = {"milk": 1.0, "coffee": 0.10}  # how strongly each scatters, relative to milk
 WATER = (0.86, 0.94, 0.95)  # what a cup of water leaves of the light that has been to the bottom and back
 DENSITY = 7.0  # how fast coffee and milk make water opaque: a tenth of them hides half of the vessel's floor
 TOTAL = 1e-6  # how far proportions may miss one
@@ -58,29 +55,12 @@ SURFACE = Material(roughness=0.08, specular=0.5)
 
 @dataclass(frozen=True, eq=False)
 class Vessel:
-    """The inside of a vessel that stands upright.
+    """The inside of a vessel that stands upright."""
 
-    Attributes:
-        axis: (2,) x and y of the line that the wall is seen from.
-        heights: (R,) evenly spaced z, from the floor to the brim.
-        radii: (R, K) distance of the wall from the axis, in K evenly spaced directions from +x counter-clockwise.
-        color: (3,) linear reflectance of the wall's lower half.
-    """
-
-    axis: Doubles
-    heights: Doubles
-    radii: Doubles
-    color: Doubles
-
-
-def _vessel(control: str, scene: SceneDescription) -> Vessel:
-    vessel = interior(scene.object)
-    if vessel is None:
-        raise InputError(
-            f"`controls` {control}: expected a vessel, open at the top and closed around and below (a mug, a "
-            f"bowl, a glass), got {scene.object.name!r}; choose another object or leave the control out"
-        )
-    return vessel
+    axis: Doubles  # (2,) x and y of the line that the wall is seen from
+    heights: Doubles  # (R,) evenly spaced z, from the floor to the brim
+    radii: Doubles  # (R, K) distance of the wall from the axis, in K even directions from +x counter-clockwise
+    color: Doubles  # (3,) linear reflectance of the wall's lower half
 
 
 @lru_cache(maxsize=8)
@@ -99,7 +79,13 @@ def interior(asset: ObjectAsset) -> Vessel | None:
     if met.mean() < CLOSED or not met.any(axis=1).all():
         return None
     middle = np.array([np.median(row[np.isfinite(row)]) for row in radii])
-    return Vessel(axis, heights, np.where(met, radii, middle[:, None]), _color(asset, faces[faces >= 0]))
+    places = mesh.uvs[mesh.faces[faces[faces >= 0]].astype(np.int64)].mean(axis=1)  # middles of faces in the texture
+    places -= np.floor(places) if mesh.repeats else 0.0
+    height, width = asset.base_color.shape[:2]
+    column = np.clip((places[:, 0] * width).astype(np.int64), 0, width - 1)
+    row = np.clip(((1.0 - places[:, 1]) * height).astype(np.int64), 0, height - 1)
+    color = np.asarray(srgb_to_linear(asset.base_color[row, column]).mean(axis=0), dtype=np.float64)
+    return Vessel(axis, heights, np.where(met, radii, middle[:, None]), color)
 
 
 def _basin(mesh: Mesh) -> tuple[Doubles, float, float] | None:
@@ -158,52 +144,33 @@ def _filled(ground: Doubles) -> Doubles:
 def _wall(mesh: Mesh, axis: Doubles, height: float) -> tuple[Doubles, Ints]:
     """Cast level rays from the axis at one height. Returns the (COLUMNS,) distance of the first surface in each
     direction, infinite where there is none, and its face or -1."""
-    face, begin, end = _section(mesh, height)
-    begin, end = begin - axis, end - axis
-    angle = np.arange(COLUMNS) * 2.0 * np.pi / COLUMNS
-    toward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    side_begin = toward[:, :1] * begin[:, 1] - toward[:, 1:] * begin[:, 0]  # on which side of the ray, (COLUMNS, S)
-    side_end = toward[:, :1] * end[:, 1] - toward[:, 1:] * end[:, 0]
-    crossed = (side_begin > 0.0) != (side_end > 0.0)
-    share = side_begin / np.where(crossed, side_begin - side_end, 1.0)
-    distance = (toward @ begin.T) * (1.0 - share) + (toward @ end.T) * share
-    distance = np.where(crossed & (distance > 0.0), distance, np.inf)
-    if distance.shape[1] == 0:
-        return np.full(COLUMNS, np.inf), np.full(COLUMNS, -1)
-    first = distance.argmin(axis=1)
-    nearest = distance[np.arange(COLUMNS), first]
-    return nearest, np.where(np.isfinite(nearest), face[first], -1)
-
-
-def _section(mesh: Mesh, height: float) -> tuple[Ints, Doubles, Doubles]:
-    """Cut a mesh at a height: the faces that are cut (S,), and the ends (S, 2) of the cut through each."""
     corners = mesh.vertices[mesh.faces.astype(np.int64)].astype(np.float64)
     above = corners[..., 2] > height
     face = np.nonzero(above.any(axis=1) & ~above.all(axis=1))[0]
-    corners, above = corners[face], above[face]
+    if not len(face):
+        return np.full(COLUMNS, np.inf), np.full(COLUMNS, -1)
+    corners, above, number = corners[face], above[face], np.arange(len(face))
     alone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))  # the corner on its side
-    number = np.arange(len(face))
     apex = corners[number, alone]
-    ends = []
+    ends = []  # of the cut through each face, from the axis
     for step in (1, 2):
         other = corners[number, (alone + step) % 3]
         share = (height - apex[:, 2]) / np.where(other[:, 2] == apex[:, 2], 1.0, other[:, 2] - apex[:, 2])
-        ends.append(apex[:, :2] + share[:, None] * (other[:, :2] - apex[:, :2]))
-    return face, ends[0], ends[1]
+        ends.append(apex[:, :2] + share[:, None] * (other[:, :2] - apex[:, :2]) - axis)
+    angle = np.arange(COLUMNS) * 2.0 * np.pi / COLUMNS
+    toward = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    first, last = (toward[:, :1] * end[:, 1] - toward[:, 1:] * end[:, 0] for end in ends)  # sides of rays, (COLUMNS, S)
+    crossed = (first > 0.0) != (last > 0.0)
+    share = first / np.where(crossed, first - last, 1.0)
+    distance = (toward @ ends[0].T) * (1.0 - share) + (toward @ ends[1].T) * share
+    distance = np.where(crossed & (distance > 0.0), distance, np.inf)
+    nearest = distance.argmin(axis=1)
+    distance = distance[np.arange(COLUMNS), nearest]
+    return distance, np.where(np.isfinite(distance), face[nearest], -1)
 
 
-def _color(asset: ObjectAsset, faces: Ints) -> Doubles:
-    """Mean linear reflectance (3,) of the texture at the middles of some faces."""
-    middle = asset.mesh.uvs[asset.mesh.faces[faces].astype(np.int64)].mean(axis=1)
-    middle -= np.floor(middle) if asset.mesh.repeats else 0.0
-    height, width = asset.base_color.shape[:2]
-    column = np.clip((middle[:, 0] * width).astype(np.int64), 0, width - 1)
-    row = np.clip(((1.0 - middle[:, 1]) * height).astype(np.int64), 0, height - 1)
-    return np.asarray(srgb_to_linear(asset.base_color[row, column]).mean(axis=0), dtype=np.float64)
-
-
-class ContentsControl(NumberControl):
-    """What a vessel is filled with, and how high.
+class ContentsControl(Control):
+    """What a vessel is filled with, and how high: water, coffee and milk.
 
     Raises:
         InputError: proportions that cannot add up to one.
@@ -212,7 +179,6 @@ class ContentsControl(NumberControl):
     kind = "contents"
     amount = "level"
     refines = frozenset({"object.to_world"})  # which is not changed; but it comes after whatever moves the vessel
-    summary = "What a vessel is filled with, and how high: water, coffee and milk."
     parameters = (
         moving(
             ORBIT, "level", "1", 0.0, 1.0, 0.0, "Height of the liquid: 0 is empty, 1 is full to the brim.", (0.0, 0.95)
@@ -225,48 +191,8 @@ class ContentsControl(NumberControl):
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
-        self.bounds = self._feasible()
-
-    def prepare(self, scene: SceneDescription) -> SceneDescription:
-        vessel = _vessel(self.name, scene)
-        angle = np.arange(COLUMNS) * 2.0 * np.pi / COLUMNS
-        uvs = np.concatenate([[(0.5, 0.5)], 0.5 + 0.45 * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
-        vertices = _surface(vessel, torch.tensor(0.5)).numpy()
-        mesh = replace(polygon(COLUMNS), vertices=vertices, uvs=uvs.astype(np.float32))
-        color = np.zeros((4, 4, 3), dtype=np.float32)
-        return scene.with_part(MeshPart(self.name, mesh, color, SURFACE, to_world=object_to_world(scene)))
-
-    def fit(self) -> None:
-        super().fit()
-        cuts = self.cuts({one.name: float(one.default) for one in self.parameters if one.name in INGREDIENTS})
-        for slot in self.slots:
-            if slot.width and slot.parameter.name in cuts:
-                self.start[slot.begin] = cuts[slot.parameter.name]
-
-    def values(self, u: Tensor) -> dict[str, Tensor]:
-        values = super().values(u)  # of ingredients, where the stick is cut
-        return {**values, **self.proportions(values)}
-
-    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        values = self.values(u.detach())
-        return super().describe(u, so_far) | {f"{self.name}.{name}": measure(values[name], "1") for name in INGREDIENTS}
-
-    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        vessel = _vessel(self.name, self.scene)
-        base = _surface(vessel, torch.full_like(values["level"], 0.5))
-        inputs = {f"{self.name}.offsets": _surface(vessel, values["level"]) - base}
-        if "object.to_world" in so_far:
-            inputs[f"{self.name}.to_world"] = so_far["object.to_world"]
-        shares = torch.stack([values[name] for name in INGREDIENTS])
-        color = liquid(shares, torch.from_numpy(vessel.color).to(shares))
-        inputs[f"{self.name}.base_color"] = color.expand(4, 4, 3)
-        return inputs
-
-    # ---- proportions ------------------------------------------------------------------------------------------------
-
-    def _feasible(self) -> dict[str, tuple[float, float]]:
-        """The range of every ingredient: as given; free if not given and searched; or what the given ones leave."""
-        bounds: dict[str, tuple[float, float]] = {}
+        # of every ingredient: as given; free if not given and searched; or what the given ones leave
+        bounds = self.bounds = dict[str, tuple[float, float]]()
         for name in INGREDIENTS:
             spec = self.specs.get(name)
             if spec is not None and not isinstance(spec, Fixed) and type(spec) is not Range:
@@ -293,46 +219,80 @@ class ContentsControl(NumberControl):
             if name not in bounds:
                 bounds[name] = (0.0, rest) if searched else (rest, rest)
                 rest = rest if searched else 0.0
-        return bounds
 
-    def spec(self, parameter: Parameter, value: Number) -> Spec:
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        vessel = interior(scene.object)
+        if vessel is None:
+            raise InputError(
+                f"`controls` {self.name}: expected a vessel, open at the top and closed around and below (a mug, a "
+                f"bowl, a glass), got {scene.object.name!r}; choose another object or leave the control out"
+            )
+        angle = np.arange(COLUMNS) * 2.0 * np.pi / COLUMNS
+        uvs = np.concatenate([[(0.5, 0.5)], 0.5 + 0.45 * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
+        vertices = _surface(vessel, torch.tensor(0.5)).numpy()
+        mesh = replace(polygon(COLUMNS), vertices=vertices, uvs=uvs.astype(np.float32))
+        color = np.zeros((4, 4, 3), dtype=np.float32)
+        return scene.with_part(MeshPart(self.name, mesh, color, SURFACE, to_world=object_to_world(scene)))
+
+    def fit(self) -> None:
+        super().fit()
+        cuts = self.cuts({one.name: float(one.default) for one in self.parameters if one.name in INGREDIENTS})
+        for slot in self.slots:
+            if slot.width and slot.parameter.name in cuts:
+                self.start[slot.begin] = cuts[slot.parameter.name]
+
+    def values(self, u: Tensor) -> dict[str, Tensor]:
+        values = super().values(u)  # of ingredients, where the stick is cut
+        return {**values, **self.proportions(values)}
+
+    def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+        return {name: measure(values[name], "1") for name in INGREDIENTS}
+
+    def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        vessel = interior(self.scene.object)
+        assert vessel is not None  # see `prepare`
+        base = _surface(vessel, torch.full_like(values["level"], 0.5))
+        inputs = {f"{self.name}.offsets": _surface(vessel, values["level"]) - base}
+        if "object.to_world" in so_far:
+            inputs[f"{self.name}.to_world"] = so_far["object.to_world"]
+        shares = torch.stack([values[name] for name in INGREDIENTS])
+        color = liquid(shares, torch.from_numpy(vessel.color).to(shares))
+        inputs[f"{self.name}.base_color"] = color.expand(4, 4, 3)
+        return inputs
+
+    # ---- proportions ------------------------------------------------------------------------------------------------
+
+    def spec(self, parameter: Parameter) -> Spec:
         """An ingredient's coordinate is where the stick is cut, from 0 to 1 of what is possible there."""
         if parameter.name not in INGREDIENTS:
-            return super().spec(parameter, value)
+            return super().spec(parameter)
         wide = [name for name in INGREDIENTS if self.bounds[name][1] > self.bounds[name][0]]
         return Range(0.0, 1.0) if parameter.name in wide[:-1] else Fixed(0.0)
 
     def proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Cut the stick: coordinates in [0, 1] by ingredient to shares that add up to one; differentiable."""
-
-        def cut_off(name: str, low: Tensor, high: Tensor) -> Tensor:
-            return low + (high - low).clamp_min(0.0) * cuts[name]
-
-        return self._in_turn(cuts[INGREDIENTS[0]].device, cut_off)
+        left, shares = torch.ones_like(cuts[INGREDIENTS[0]]), dict[str, Tensor]()
+        for name in INGREDIENTS:
+            low, high = self._ends(name, left)
+            shares[name] = low + (high - low).clamp_min(0.0) * cuts[name]
+            left = left - shares[name]
+        return shares
 
     def cuts(self, shares: Mapping[str, float]) -> dict[str, float]:
         """Return the coordinates whose shares are nearest to some, one ingredient after the other."""
-        cuts = {}
-
-        def nearest(name: str, low: Tensor, high: Tensor) -> Tensor:
-            least, most = float(low), float(high)
-            share = min(max(shares[name], least), max(least, most))
-            cuts[name] = (share - least) / (most - least) if most > least else 0.0
-            return low.new_tensor(share)
-
-        self._in_turn(torch.device("cpu"), nearest)
+        left, cuts = torch.ones(()), dict[str, float]()
+        for name in INGREDIENTS:
+            low, high = map(float, self._ends(name, left))
+            share = min(max(shares[name], low), max(low, high))
+            cuts[name] = (share - low) / (high - low) if high > low else 0.0
+            left = left - share
         return cuts
 
-    def _in_turn(self, device: torch.device, share: Callable[[str, Tensor, Tensor], Tensor]) -> dict[str, Tensor]:
-        """Give each ingredient in turn a share () of what is left, between the least and the most that it may have, so
-        that those after it can make up one."""
-        limits = torch.tensor([self.bounds[name] for name in INGREDIENTS]).to(device)
-        left, shares = torch.ones_like(limits[0, 0]), {}
-        for place, name in enumerate(INGREDIENTS):
-            (low, high), (least, most) = limits[place], limits[place + 1 :].sum(dim=0)
-            shares[name] = share(name, torch.maximum(low, left - most), torch.minimum(high, left - least))
-            left = left - shares[name]
-        return shares
+    def _ends(self, name: str, left: Tensor) -> tuple[Tensor, Tensor]:
+        """The least and the most () that an ingredient may have of what is left, so that those after it make up one."""
+        place, limits = INGREDIENTS.index(name), left.new_tensor([self.bounds[one] for one in INGREDIENTS])
+        (low, high), (least, most) = limits[place], limits[place + 1 :].sum(dim=0)
+        return torch.maximum(low, left - most), torch.minimum(high, left - least)
 
 
 # ---- how it looks ---------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -19,8 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch.controls import corruption_filters as filters
-from advsearch.controls.base import Choice, Parameter, Value, measure, number
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named, number
 from advsearch.scene.formation import levels_of
 
 BRIGHTNESS = ((0.1,), (0.2,), (0.3,), (0.4,), (0.5,))  # added to the value of hue, saturation and value
@@ -106,36 +106,27 @@ STEPPED: Mapping[str, Callable[[Tensor, int], Tensor]] = {"pixelate": pixelate, 
 NAMES = (*SMOOTH, *FROM_NOTHING, *STEPPED)
 
 
-class CorruptionControl(NumberControl):
-    """One of the common image corruptions, by name and severity."""
+class CorruptionControl(Control):
+    """A common image corruption (noise, blur, weather, digital) by name and severity."""
 
     kind = "corruption"
     amount = "severity"
-    summary = "A common image corruption (noise, blur, weather, digital) by name and severity."
     parameters = (
-        Parameter(
-            "which", (), "name", 0, len(NAMES) - 1, NAMES[0], "Which corruption.", search=(0, len(NAMES) - 1),
-            options=NAMES, estimators=(),
-        ),
-        number(
-            ("image",), "severity", "1", 0.0, float(filters.LEVELS), 0.0,
-            "How strong it is: 0 is none, 1 to 5 are the published severities.", (0.0, float(filters.LEVELS)),
-        ),
+        replace(named("which", NAMES, NAMES[0], "Which corruption."), search=(0, len(NAMES) - 1)),
+        number(("image",), "severity", "1", 0.0, float(filters.LEVELS), 0.0,
+               "How strong it is: 0 is none, 1 to 5 are the published severities.", (0.0, float(filters.LEVELS))),
     )  # fmt: skip
-    choices = (
-        Choice(
-            "seed", 0, "Which draw of the noise, the snow, the wrinkles: a whole number from 0.", whole=(0, 2**32 - 1)
-        ),
-    )
+    choices = (Choice("seed", 0, "Which draw of the noise, the snow, the wrinkles: a whole number from 0.",
+                      whole=(0, 2**32 - 1)),)  # fmt: skip
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
         # a name without a severity does nothing, and a severity needs a name: what is not given is searched
         self.asked = False
 
-    def estimators(self, parameter: Parameter) -> tuple[str, ...]:
-        stepped = {*self.allowed("which", *NAMES)} <= {*STEPPED}
-        return () if parameter.name == "severity" and stepped else super().estimators(parameter)
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        stepped = parameter.name == "severity" and {*self.allowed("which", *NAMES)} <= {*STEPPED}
+        return replace(parameter, estimators=()) if stepped else parameter
 
     def on_picture(self, values: Values, image: Tensor) -> Tensor:
         return corrupted(image, NAMES[int(values["which"])], values["severity"], int(self.chosen["seed"]))

@@ -19,8 +19,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Fixed, Number, Parameter, number
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Control, Parameter, Values, named, number
+from advsearch.controls.ranges import Fixed, Number, Range
 from advsearch.errors import InputError
 from advsearch.scene import library, settings
 from advsearch.scene.assets import EnvironmentAsset
@@ -35,31 +35,21 @@ MAPS = tuple(sorted({*library.list_environments()} - {*library.list_environments
 """The bundled environments that are a map; the others are a place around the object."""
 
 
-class EnvironmentControl(NumberControl):
+class EnvironmentControl(Control):
     """Which environment lights the scene, how it is turned, how bright it is, and its colour."""
 
     kind = "environment"
-    summary = "Which environment lights the scene, how it is turned, how bright it is, and its colour."
     parameters = (
-        Parameter(
-            "which", (), "name", 0.0, float(len(MAPS)), OWN_MAP,
-            "Another environment instead of the scene's own, metered afresh: bundled, or a .hdr or .exr file.",
-            options=(OWN_MAP, *MAPS), estimators=(),
-        ),
+        named("which", (OWN_MAP, *MAPS), OWN_MAP,
+              "Another environment instead of the scene's own, metered afresh: bundled, or a .hdr or .exr file."),
         *settings.ENVIRONMENT,
         *(number(LIT, f"tint_{color}", "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.") for color in CHANNELS),
-        Parameter(
-            "harmonics", (COEFFICIENTS,), "mean radiances", -1.0, 1.0, 0.0,
-            "Low-order light that is added: spherical-harmonic coefficients, 9 for each channel, inside the ball.",
-            estimators=LIT,
-        ),
+        Parameter("harmonics", (COEFFICIENTS,), "mean radiances", -1.0, 1.0, 0.0,
+                  "Low-order light that is added: spherical-harmonic coefficients, 9 for each channel, inside the "
+                  "ball.", estimators=LIT),
     )  # fmt: skip
-    choices = (
-        Choice(
-            "epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients.", "epsilon", "harmonics",
-            most=100.0,
-        ),
-    )  # fmt: skip
+    choices = (Choice("epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients.", "epsilon",
+                      "harmonics", most=100.0),)  # fmt: skip
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
@@ -98,19 +88,20 @@ class EnvironmentControl(NumberControl):
             scene = replace(scene, environment=_loaded(name), environment_spec=name)
         return replace(scene, remarks=(*scene.remarks, *notes)) if notes else scene
 
-    def default(self, parameter: Parameter) -> Number:
+    def in_scene(self, parameter: Parameter) -> Parameter:
         """Of `which`, the scene's own environment, by its name where only that is allowed."""
         if parameter.name != "which":
-            return super().default(parameter)
-        return OWN_MAP if OWN_MAP in self.allowed("which", OWN_MAP) else self._own_name(self.scene) or OWN_MAP
+            return super().in_scene(parameter)
+        own = None if OWN_MAP in self.allowed("which", OWN_MAP) else self._own_name(self.scene)
+        return replace(parameter, default=own or OWN_MAP)
 
     def setting(self, parameter: Parameter) -> str:
         return ENVIRONMENT if parameter.name == "which" else super().setting(parameter)
 
     def unchanged(self, parameter: Parameter) -> Number:
-        if parameter.name == "which" and OWN_MAP not in self.allowed("which", OWN_MAP):
-            return self._own_name(self.scene) or self.scene.environment_spec
-        return super().unchanged(parameter)
+        if parameter.name != "which" or OWN_MAP in self.allowed("which", OWN_MAP):
+            return parameter.default
+        return self._own_name(self.scene) or self.scene.environment_spec
 
     def _own_name(self, scene: SceneDescription) -> str | None:
         """What the scene's own environment is called among those that can be chosen; None if it is none of them."""
@@ -120,11 +111,13 @@ class EnvironmentControl(NumberControl):
         if parameter.name != "harmonics":
             return WHOLE_RANGE
         spec = self.specs["harmonics"]
-        width = getattr(spec, "high", 1.0) - getattr(spec, "low", -1.0)
+        width = spec.high - spec.low if isinstance(spec, Range) else 2.0
         return Budget("l2", float(self.chosen["epsilon"]) / width)
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        base = self._map(int(values["which"])).to(values["rotation"].device)
+        name, device = self.own[0].options[int(values["which"])], values["rotation"].device
+        own = name == OWN_MAP or _is_own(name, self.scene)
+        base = _map(None if own else _loaded(name), self.scene).to(device)
         turned = turn(base, values["rotation"] - self.scene.number("environment.rotation"))
         tint = torch.stack([values[f"tint_{color}"] for color in CHANNELS])
         stops = values["exposure"] - self.scene.number("environment.exposure")
@@ -132,10 +125,6 @@ class EnvironmentControl(NumberControl):
         if "harmonics" in self.specs:
             lit = (lit + harmonics(values["harmonics"], base)).clamp_min(0.0)
         return {"environment.data": lit}
-
-    def _map(self, which: int) -> Tensor:
-        name, scene = self.own[0].options[which], self.scene
-        return _tensor_of(scene) if name == OWN_MAP or _is_own(name, scene) else _metered(_loaded(name), scene)
 
 
 def _is_file(name: Number) -> bool:
@@ -146,7 +135,7 @@ def _is_own(name: Number, scene: SceneDescription) -> bool:
     """Whether an environment is the scene's own."""
     own = scene.environment
     if own is None or not _is_file(name):
-        return name == scene.bundled_environment is not None
+        return own is not None and own.source == library.BUNDLED_ENVIRONMENT and own.name == name
     return bool(own.source) and os.path.realpath(str(name)) == os.path.realpath(own.source)
 
 
@@ -166,15 +155,13 @@ def _read(place: str, name: str, *version: int) -> EnvironmentAsset:
     return import_environment(name)
 
 
-@lru_cache(maxsize=4)
-def _tensor_of(scene: SceneDescription) -> Tensor:
-    return torch.from_numpy(scene.environment_for("the environment").radiance.copy())
-
-
 @lru_cache(maxsize=64)
-def _metered(asset: EnvironmentAsset, scene: SceneDescription) -> Tensor:
-    """Another map in its own size, as bright as keeps the picture's exposure; the ground stays of the same kind."""
+def _map(asset: EnvironmentAsset | None, scene: SceneDescription) -> Tensor:
+    """The scene's own map, or another in its own size, as bright as keeps the picture's exposure; the ground stays of
+    the same kind."""
     own = scene.environment_for("the environment")
+    if asset is None:
+        return torch.from_numpy(own.radiance.copy())
     there = replace(scene, environment=replace(asset, photographed=own.photographed))
     share = metered_gain(there) / metered_gain(scene) if scene.metered else 1.0
     return torch.from_numpy(asset.radiance.copy()) * share

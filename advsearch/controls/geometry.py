@@ -28,7 +28,7 @@ from torch import Tensor
 
 from advsearch.controls.base import NOTHING, Choice, Control, Group, Parameter, Value, measure
 from advsearch.scene.assembly import MovingMesh
-from advsearch.scene.assets import Doubles, Ints, Mesh, face_vectors
+from advsearch.scene.assets import Doubles, Mesh, face_vectors
 from advsearch.scene.raster import welded
 
 CELL = 0.035
@@ -49,52 +49,33 @@ WALL_WEIGHT = 4.0  # weight of a link through a wall, in edges of the mesh
 
 
 class Body:
-    """A mesh whose seams are welded: what a displacement acts on.
-
-    Attributes:
-        places: (P, 3) float64 distinct vertex positions.
-        index: (V,) the place of each vertex.
-        faces: (F, 3) faces over places, without those that have no area.
-        normals: (P, 3) area-weighted unit normals.
-        extent: the mesh's largest extent.
-        walls: (W, 2) pairs of places on opposite sides of a wall or of a gap.
-
-    Args:
-        mesh: the mesh.
-    """
+    """A mesh whose seams are welded: what a displacement acts on."""
 
     def __init__(self, mesh: Mesh) -> None:
-        self.index, count = welded(mesh)
-        self.places = np.zeros((count, 3))
+        self.index, count = welded(mesh)  # (V,) the place of each vertex
+        self.places = np.zeros((count, 3))  # distinct vertex positions
         self.places[self.index] = mesh.vertices
         self.extent = float(np.ptp(self.places, axis=0).max())
         faces = self.index[mesh.faces]
-        corners = self.places[faces]
-        turned = face_vectors(corners)
-        self.faces = faces[np.linalg.norm(turned, axis=1) > 0.0]
+        turned = face_vectors(self.places[faces])
+        self.faces = faces[np.linalg.norm(turned, axis=1) > 0.0]  # over places, without those that have no area
         summed = np.zeros((count, 3))
         np.add.at(summed, faces.reshape(-1), np.repeat(turned, 3, axis=0))
-        self.normals = summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20)
-        self.walls = self._walls()
-
-    def _walls(self) -> Ints:
-        """The nearest place with an opposite normal for each place, where there is one: nearest in
-        `|x - y|^2 + b^2 |n + m|^2`, a search in six dimensions."""
+        self.normals = summed / np.maximum(np.linalg.norm(summed, axis=1, keepdims=True), 1e-20)  # by area
+        # (W, 2) places on opposite sides of a wall or of a gap: for each the nearest with an opposite normal, where
+        # there is one, by |x - y|^2 + b^2 |n + m|^2, a search in six dimensions
         turn = 0.1 * self.extent * self.normals
         partner = cKDTree(np.hstack([self.places, turn])).query(np.hstack([self.places, -turn]))[1]
         distance = np.linalg.norm(self.places - self.places[partner], axis=1)
         opposite = (self.normals * self.normals[partner]).sum(axis=1) < OPPOSITE
         place = np.flatnonzero(opposite & (distance > 1e-5 * self.extent) & (distance < WALL_REACH * self.extent))
-        return np.stack([place, partner[place]], axis=1)
+        self.walls = np.stack([place, partner[place]], axis=1)
 
 
 # ---- modes over space ------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=8)
-def body(mesh: Mesh) -> Body:
-    """Return the welded mesh; kept in memory."""
-    return Body(mesh)
+body = lru_cache(maxsize=8)(Body)  # of a mesh; kept in memory
 
 
 @lru_cache(maxsize=8)
@@ -111,28 +92,21 @@ def shape_modes(mesh: Mesh, count: int) -> Doubles:
     density = kernel.sum(axis=1)
     kernel /= density[:, None] * density[None, :]
     mass = kernel.sum(axis=1)
-    values, vectors = _largest(kernel / np.sqrt(mass[:, None] * mass[None, :]), scalars + 1)
-    values, vectors = values[1:], vectors[:, 1:]  # the first is constant
+    symmetric = kernel / np.sqrt(mass[:, None] * mass[None, :])
+    # by Lanczos, without entries too small to matter: dense solvers wait for all threads, which takes ten times as long
+    # on a machine with other work
+    large = sparse.csr_matrix(np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0))
+    begin, reach = np.cos(np.arange(len(points))), min(len(points), 4 * (scalars + 1))
+    values, vectors = sparse_linalg.eigsh(large, scalars + 1, which="LA", v0=begin, ncv=reach)
+    falling = np.argsort(-values)[1:]  # the first is constant
+    values, vectors = values[falling], _signed(vectors[:, falling])
     functions = vectors / np.sqrt(mass)[:, None]
     combination = _without_rotation(points, functions, mass, (1.0 - values) / width**2, count)
-    reach = -cdist(welded_mesh.places, points, "sqeuclidean") / (2.0 * width**2)
-    weights = np.exp(reach - reach.max(axis=1, keepdims=True)) / density
+    near = -cdist(welded_mesh.places, points, "sqeuclidean") / (2.0 * width**2)
+    weights = np.exp(near - near.max(axis=1, keepdims=True)) / density
     extended = (weights / weights.sum(axis=1, keepdims=True)) @ (functions / np.maximum(values, 0.05))
     fields = np.einsum("ps,sck->pck", extended, combination)
     return np.asarray(fields / np.linalg.norm(fields, axis=1).max(axis=0))
-
-
-def _largest(symmetric: Doubles, count: int) -> tuple[Doubles, Doubles]:
-    """The largest eigenvalues of a symmetric matrix, falling, and their vectors with the largest entry positive.
-    Entries too small to matter are dropped and the rest goes through Lanczos: dense solvers wait for all threads, which
-    takes ten times as long on a machine with other work."""
-    sparse_matrix = sparse.csr_matrix(np.where(symmetric > 1e-7 * symmetric.max(), symmetric, 0.0))
-    begin = np.cos(np.arange(len(symmetric)))
-    values, vectors = sparse_linalg.eigsh(
-        sparse_matrix, count, which="LA", v0=begin, ncv=min(len(symmetric), 4 * count)
-    )
-    order = np.argsort(-values)
-    return values[order], _signed(vectors[:, order])
 
 
 def _signed(vectors: Doubles) -> Doubles:
@@ -235,11 +209,8 @@ class Limits:
     with `r_i` what each bound would be used up to, 1 being all of it: the length of d at each place (1), the gradient
     of the displacement along each face (`FACE_STRAIN`), and between the two sides of each wall (`WALL_STRAIN`). As
     `s max r < 1`, no place moves further than epsilon, no face turns over (its tangent map is I + B with ||B|| < 1,
-    and so has a positive determinant), and walls and gaps between places keep more than half their width.
-
-    Args:
-        solid: the welded mesh.
-        epsilon: largest displacement, in the mesh's units.
+    and so has a positive determinant), and walls and gaps between places keep more than half their width. Epsilon is
+    in the mesh's units.
     """
 
     def __init__(self, solid: Body, epsilon: float) -> None:
@@ -305,23 +276,17 @@ class GeometryControl(Control):
 
     kind = "geometry"
     of_a_mesh = True
-    summary = "A smooth change of the object's shape, at most so far."
     parameters = (
-        Parameter(
-            "amplitudes", (None,), "1", -1.0, 1.0, 0.0,
-            "How much of each smooth mode of the shape is added (form modes).", moves_silhouettes=True,
-            search=(-1.0, 1.0), estimators=ESTIMATORS,
-        ),
-        Parameter(
-            "pushes", (None, 3), "1", -1.0, 1.0, 0.0, "Push on each vertex before it is spread out (form large-steps).",
-            moves_silhouettes=True, search=(-1.0, 1.0), estimators=ESTIMATORS,
-        ),
+        Parameter("amplitudes", (None,), "1", -1.0, 1.0, 0.0,
+                  "How much of each smooth mode of the shape is added (form modes).", moves_silhouettes=True,
+                  search=(-1.0, 1.0), estimators=ESTIMATORS),
+        Parameter("pushes", (None, 3), "1", -1.0, 1.0, 0.0,
+                  "Push on each vertex before it is spread out (form large-steps).", moves_silhouettes=True,
+                  search=(-1.0, 1.0), estimators=ESTIMATORS),
     )  # fmt: skip
     choices = (
-        Choice(
-            "epsilon", DEFAULT_EPSILON, "Largest displacement of a vertex, in object sizes.", "epsilon",
-            most=LARGEST_EPSILON,
-        ),
+        Choice("epsilon", DEFAULT_EPSILON, "Largest displacement of a vertex, in object sizes.", "epsilon",
+               most=LARGEST_EPSILON),
         Choice("modes", DEFAULT_MODES, "Number of smooth modes (form modes).", whole=(1, LARGEST_MODES)),
         Choice("form", "modes", "What is searched: modes (a few smooth fields) or large-steps (every vertex)."),
     )  # fmt: skip

@@ -10,12 +10,13 @@ mix display values; here linear light is mixed. They are put on the finished pic
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, OneOf, Parameter, number
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Parameter, Values, number
+from advsearch.controls.ranges import OneOf
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.settings import CHANNELS
 
@@ -33,25 +34,21 @@ def _per_dot(
     return Parameter(name, (None,), unit, low, 1.0, default, text, search=search, log=log, estimators=("image",))
 
 
-class LensControl(NumberControl):
-    """Translucent dots on the camera's lens."""
+class LensControl(Control):
+    """Translucent, blurred dots on the camera's lens: their places, sizes, colours, opacities."""
 
     kind = "lens"
     amount = "opacity"
-    summary = "Translucent, blurred dots on the camera's lens: their places, sizes, colours, opacities."
     parameters = (
         _per_dot("x", "picture widths", 0.5, "Centre of each dot, from the left edge."),
         _per_dot("y", "picture heights", 0.5, "Centre of each dot, from the top edge."),
-        _per_dot(
-            "radius", "picture sizes", 0.12,
-            "Distance at which a dot has lost 63 % of its opacity, as a share of the picture's smaller side.",
-            (0.03, 0.25), 0.01, log=True,
-        ),
+        _per_dot("radius", "picture sizes", 0.12,
+                 "Distance at which a dot has lost 63 % of its opacity, as a share of the picture's smaller side.",
+                 (0.03, 0.25), 0.01, log=True),
         *(_per_dot(color, "sRGB", 0.5, f"{color.capitalize()} of each dot.") for color in CHANNELS),
         _per_dot("opacity", "1", 0.0, "Opacity in the middle of each dot; 0 is no dot.", (0.0, 0.5)),
-        number(
-            ("image",), "falloff", "1", 1.0, 8.0, 1.0, "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc."
-        ),
+        number(("image",), "falloff", "1", 1.0, 8.0, 1.0,
+               "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc."),
     )  # fmt: skip
     choices = (Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}.", whole=(1, MOST_DOTS)),)
 
@@ -60,8 +57,8 @@ class LensControl(NumberControl):
         """How many dots there are."""
         return int(self.chosen["dots"])
 
-    def size(self, parameter: Parameter) -> int:
-        return self.dots if parameter.shape else 1
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        return replace(parameter, shape=(self.dots,)) if parameter.shape else parameter
 
     def fit(self) -> None:
         super().fit()
@@ -91,10 +88,8 @@ def spread(count: int) -> Tensor:
     """Return `count` places spread evenly over the middle 80 % of the picture, the first in its centre.
 
     The places are a lattice with the two irrational steps of the plastic number, a two-dimensional golden ratio
-    (Roberts 2018, The unreasonable effectiveness of quasirandom sequences, R2).
-
-    Returns:
-        (2, count) float32: x and y in [0.1, 0.9].
+    (Roberts 2018, The unreasonable effectiveness of quasirandom sequences, R2). They are (2, count) float32: x and y in
+    [0.1, 0.9].
     """
     plastic = 1.324717957244746
     steps = torch.tensor([[1.0 / plastic], [1.0 / plastic**2]], dtype=torch.float64)
@@ -114,19 +109,15 @@ def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         (H, W, 3) sRGB in [0, 1]; differentiable in the picture and in every value.
     """
     shades = srgb_to_linear(torch.stack([values[color] for color in CHANNELS], dim=-1)).to(image.device)
-    covers, light = _covers(image.shape[0], image.shape[1], values).to(image.device), srgb_to_linear(image)
-    for cover, shade in zip(covers, shades, strict=True):
-        light = light + cover[..., None] * (shade - light)
-    return linear_to_srgb(light)
-
-
-def _covers(height: int, width: int, values: Mapping[str, Tensor]) -> Tensor:
-    """Return (dots, H, W): the opacity of each dot at each pixel's centre."""
-    side, device = min(height, width), values["x"].device
+    height, width = image.shape[:2]
+    side, device, falloff = min(height, width), values["x"].device, values["falloff"]
     across = (torch.arange(width, device=device) + 0.5 - values["x"][:, None] * width) / side
     down = (torch.arange(height, device=device) + 0.5 - values["y"][:, None] * height) / side
     squared = down[:, :, None] ** 2 + across[:, None, :] ** 2
     distance = squared / values["radius"][:, None, None] ** 2
-    falloff = values["falloff"]
-    reach = _FAR ** (1.0 / falloff.detach())
-    return values["opacity"][:, None, None] * torch.exp(-(distance.clamp(1e-12, float(reach)) ** falloff))
+    reach = float(_FAR ** (1.0 / falloff.detach()))
+    covers = values["opacity"][:, None, None] * torch.exp(-(distance.clamp(1e-12, reach) ** falloff))
+    covers, light = covers.to(image.device), srgb_to_linear(image)
+    for cover, shade in zip(covers, shades, strict=True):
+        light = light + cover[..., None] * (shade - light)
+    return linear_to_srgb(light)

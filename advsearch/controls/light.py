@@ -13,19 +13,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Fixed, Number, Parameter, number
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Parameter, Values, color_of, number
+from advsearch.controls.ranges import Fixed, Number
 from advsearch.errors import InputError
-from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import WHITE, metered_gain
 from advsearch.scene.geometry import affine
 from advsearch.scene.parts import BallLamp, PointLamp
-from advsearch.scene.settings import CHANNELS, LIT, colors, moving
+from advsearch.scene.settings import LIT, colors, moving
 
 LIT_WHITE = 0.9  # linear display value of a white surface that faces a lamp of power 1 at distance 1
 LIT_POWER = 6.0
@@ -42,33 +42,25 @@ def _place(name: str, low: float, high: float, default: float, description: str)
     return moving(("differences",), name, "object sizes", -1000.0, 1000.0, default, description, (low, high))
 
 
-class LightControl(NumberControl):
-    """One lamp beside the environment."""
+class LightControl(Control):
+    """A lamp: where it stands, its colour, its power, and the size of an area light."""
 
     kind = "light"
     amount = "power"
-    summary = "A lamp: where it stands, its colour, its power, and the size of an area light."
     parameters = (
         _place("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
         _place("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
         _place("z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."),
         *colors("of the lamp's colour.", (0.6, 1.0)),
-        number(
-            LIT, "power", "1", 0.0, 1000.0, 0.0,
-            "Irradiance at distance 1, in multiples of the one that shows a white surface just below white.",
-            (0.0, 12.0),
-        ),
-        moving(
-            ("differences",), "size", "object sizes", 0.001, 10.0, 0.2, "Diameter of an area light; a point has none.",
-            (0.05, 0.6), log=True,
-        ),
+        number(LIT, "power", "1", 0.0, 1000.0, 0.0,
+               "Irradiance at distance 1, in multiples of the one that shows a white surface just below white.",
+               (0.0, 12.0)),
+        moving(("differences",), "size", "object sizes", 0.001, 10.0, 0.2,
+               "Diameter of an area light; a point has none.", (0.05, 0.6), log=True),
     )  # fmt: skip
-    choices = (
-        Choice(
-            "type", "area", "area (a ball that glows: soft shadows, visible) or point (sharp shadows, invisible).",
-            options=("area", "point"),
-        ),
-    )  # fmt: skip
+    choices = (Choice("type", "area",
+                      "area (a ball that glows: soft shadows, visible) or point (sharp shadows, invisible).",
+                      options=("area", "point")),)  # fmt: skip
 
     def check_choices(self) -> None:
         if self.chosen["type"] == "point" and "size" in self._given:
@@ -77,17 +69,15 @@ class LightControl(NumberControl):
                 f"{self.name}.type to area"
             )
 
-    def default(self, parameter: Parameter) -> Number:
+    def in_scene(self, parameter: Parameter) -> Parameter:
         if parameter.name == "power" and self.asked and not self.searches("power"):
-            return LIT_POWER
-        return parameter.default
+            return replace(parameter, default=LIT_POWER)
+        if parameter.name == "size" and self.chosen["type"] == "point":
+            return replace(parameter, search=None)
+        return parameter
 
     def unchanged(self, parameter: Parameter) -> Number:
-        return parameter.default
-
-    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
-        is_point = self.chosen["type"] == "point"
-        return None if is_point and parameter.name == "size" else parameter.search
+        return 0.0  # of the power; see `amount`
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         lamp = PointLamp if self.chosen["type"] == "point" else BallLamp
@@ -96,8 +86,7 @@ class LightControl(NumberControl):
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         place = torch.stack([values[axis] for axis in ("x", "y", "z")])
-        tint = srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))
-        intensity = tint * values["power"] * metered_irradiance(self.scene)
+        intensity = color_of(values) * values["power"] * metered_irradiance(self.scene)
         if self.chosen["type"] == "point":
             return {f"{self.name}.position": place, f"{self.name}.intensity": intensity}
         radius = values["size"] / 2.0

@@ -9,7 +9,7 @@ A named material has a seamless pattern and numbers of its own, as in 3DB (Lecle
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
 import numpy as np
@@ -18,8 +18,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from advsearch.controls.base import Number, Parameter
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Control, Parameter, Values, color_of, named
+from advsearch.controls.ranges import Number
 from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, Floats, Material, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
@@ -52,8 +52,7 @@ class Pattern:
     paint: Callable[[Grid], Doubles]
 
 
-PATTERNS: dict[str, Pattern] = {}
-"""Every named material by its name."""
+PATTERNS: dict[str, Pattern] = {}  # every named material by its name
 
 
 def pattern(size: float, **surface: float) -> Callable[[Callable[[Grid], Doubles]], None]:
@@ -389,17 +388,14 @@ OWN = "own"
 NUMBERS = tuple(one.name for one in MATERIAL)
 
 
-class MaterialControl(NumberControl):
+class MaterialControl(Control):
     """The object's gloss, metal, coat and tint, and which named material covers it."""
 
     kind = "material"
     of_a_mesh = True
-    summary = "The object's gloss, metal, coat and tint, and which named material covers it."
     parameters = (
-        Parameter(
-            "which", (), "name", 0.0, float(len(PATTERNS)), OWN,
-            "The object's own surface, or a named material in its place.", options=(OWN, *PATTERNS),
-        ),
+        named("which", (OWN, *PATTERNS), OWN, "The object's own surface, or a named material in its place.",
+              estimators=("differences",)),
         *MATERIAL,
         *colors("of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)),
     )  # fmt: skip
@@ -413,15 +409,15 @@ class MaterialControl(NumberControl):
             )
         return scene
 
-    def default(self, parameter: Parameter) -> Number:
-        if parameter.name in NUMBERS:
-            first = OWN if OWN in self._names else str(self._names[0])  # the fixed or first material
-            return float(getattr(self._own(first), parameter.name))
-        return parameter.default
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        if parameter.name not in NUMBERS:
+            return parameter
+        first = OWN if OWN in self._names else str(self._names[0])  # the fixed or first material
+        return replace(parameter, default=float(getattr(self._own(first), parameter.name)))
 
     def unchanged(self, parameter: Parameter) -> Number:
         given = self.setting(parameter) in self.scene.given
-        return self.scene.number(self.setting(parameter)) if given else self.default(parameter)
+        return self.scene.number(self.setting(parameter)) if given else parameter.default
 
     @property
     def refines(self) -> frozenset[str]:
@@ -437,8 +433,13 @@ class MaterialControl(NumberControl):
             elif self._names != (OWN,):
                 inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([float(getattr(material, name))])
         if self._colours():
-            tint = torch.stack([values[name] for name in CHANNELS])
-            inputs[self._base_color] = srgb_to_linear(tint) * self._reflectance(which, so_far).to(tint.device)
+            mesh, tint = self.mesh_in(self.scene), color_of(values)
+            base = so_far.get(self._base_color)  # what the controls before made of the texture
+            if which != OWN:
+                base = _linear_covering(mesh.mesh, which)
+            elif base is None:
+                base = srgb_to_linear(torch.from_numpy(mesh.base_color.copy()))
+            inputs[self._base_color] = tint * base.to(tint.device)
         return inputs
 
     def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -463,14 +464,6 @@ class MaterialControl(NumberControl):
 
     def _own(self, which: str) -> Material:
         return self.mesh_in(self.scene).material if which == OWN else PATTERNS[which].material
-
-    def _reflectance(self, which: str, so_far: Mapping[str, Tensor]) -> Tensor:
-        """Linear reflectance (h, w, 3) before the tint: what the controls before made of the texture, or a pattern."""
-        if which == OWN:
-            before = so_far.get(self._base_color)
-            own = self.mesh_in(self.scene).base_color
-            return srgb_to_linear(torch.from_numpy(own.copy())) if before is None else before
-        return _linear_covering(self.mesh_in(self.scene).mesh, which)
 
 
 @lru_cache(maxsize=len(PATTERNS))

@@ -12,9 +12,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Fixed, Moved, OneOf, Parameter
-from advsearch.controls.numbers import NumberControl, Slot, Values
-from advsearch.controls.ranges import LARGEST
+from advsearch.controls.base import Control, Moved, Parameter, Values
+from advsearch.controls.ranges import LARGEST, Fixed, OneOf, Slot
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.mitsuba_backend.writing import plugin_numbers
@@ -22,11 +21,10 @@ from advsearch.scene.parts import PluginNumber, PluginNumbers
 from advsearch.scene.settings import CHANNELS
 
 
-class MitsubaControl(NumberControl):
+class MitsubaControl(Control):
     """Anything else in the scene: numbers and colours by Mitsuba's own names."""
 
     kind = "mitsuba"
-    summary = "Anything else in the scene: numbers and colours by Mitsuba's own names."
     parameters = ()
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
@@ -51,7 +49,7 @@ class MitsubaControl(NumberControl):
                 )
             for parameter, value in zip(_channels(number), number.values, strict=True):
                 spec = self.specs.get(parameter.name, whole or Fixed(value))
-                yield Slot(replace(parameter, default=value), spec, 1, value)
+                yield Slot(replace(parameter, default=value), spec)
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {

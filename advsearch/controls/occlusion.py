@@ -21,8 +21,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter, Value, measure
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Value, Values, measure, named
 from advsearch.errors import InputError
 from advsearch.files import reading
 from advsearch.scene import library, silhouettes
@@ -53,14 +52,10 @@ def loaded(spec: str) -> ObjectAsset:
     where there is no such object, or the file cannot be used."""
     is_file = "/" in spec or "\\" in spec or Path(spec).suffix != ""
     with reading(spec):
-        return centred(import_object(Path(spec)) if is_file else library.load_object(spec))
-
-
-def centred(asset: ObjectAsset) -> ObjectAsset:
-    """Return an object with its largest extent 1 and the middle of its bounding box at the origin."""
-    mesh = normalised(asset.mesh)
-    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0
-    return replace(asset, mesh=replace(mesh, vertices=(mesh.vertices - middle).astype(np.float32)))
+        asset = import_object(Path(spec)) if is_file else library.load_object(spec)
+        mesh = normalised(asset.mesh)
+        middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0
+        return replace(asset, mesh=replace(mesh, vertices=(mesh.vertices - middle).astype(np.float32)))
 
 
 def _asset(option: str) -> ObjectAsset:
@@ -100,56 +95,35 @@ def sphere(rows: int, columns: int) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Where an occluder goes, in the camera's coordinates.
+    """Where an occluder goes, in the camera's coordinates; lengths are in object sizes."""
 
-    Attributes:
-        axes: (3, 3) rows: right, up and forward of a camera that looks at the middle of what is seen of the object.
-        angle: from that middle to the occluder, radians.
-        size: in object sizes, made smaller where it would not fit.
-        distance: from the camera, in object sizes, changed where it would not fit.
-        hidden: share of the object's picture area that is hidden.
-        away: it is put away, out of sight.
-    """
-
-    axes: Doubles
-    angle: float
-    size: float
-    distance: float
-    hidden: float
-    away: bool
+    axes: Doubles  # (3, 3) rows: right, up and forward of a camera that looks at the middle of what is seen
+    angle: float  # from that middle to the occluder, radians
+    size: float  # made smaller where it would not fit
+    distance: float  # from the camera, changed where it would not fit
+    hidden: float  # share of the object's picture area
+    away: bool  # it is put away, out of sight
 
 
-class OcclusionControl(NumberControl):
-    """A second object between the camera and the object."""
+class OcclusionControl(Control):
+    """A second object between the camera and the object, hiding a wanted share of it."""
 
     kind = "occlusion"
     amount = "coverage"
     refines = frozenset(SURROUNDINGS)  # none is changed; but it comes after whatever moves the camera or the object
-    summary = "A second object between the camera and the object, hiding a wanted share of it."
     parameters = (
-        Parameter(
-            "which", (), "name", 0.0, len(OPTIONS) - 1.0, "card",
-            "What it is: a piece of cardboard, a grey sphere, or a bundled object.", moves_silhouettes=True,
-            options=OPTIONS,
-        ),
-        _moving(
-            "coverage", "1", 0.0, 0.9, 0.0,
-            "Share of the object's picture area that it hides; at 0 it is out of the frame.", search=(0.0, 0.5),
-        ),
-        _moving(
-            "direction", "degrees", -3600.0, 3600.0, 0.0,
-            "Side of the picture it comes in from: 0 is the right, 90 the top, counter-clockwise.", periodic=True,
-            search=(0.0, 360.0),
-        ),
-        _moving("size", "object sizes", 0.05, 5.0, 0.6, "Its largest extent.", search=(0.3, 1.0), log=True),
-        _moving(
-            "distance", "1", 0.1, 0.9, 0.5,
-            "Where between the camera and the object's middle: 0 is the camera, 1 the middle.", search=(0.3, 0.7),
-        ),
-        _moving(
-            "turn", "degrees", -3600.0, 3600.0, 0.0, "Rotation of the occluder about its own upright axis.",
-            periodic=True,
-        ),
+        named("which", OPTIONS, "card", "What it is: a piece of cardboard, a grey sphere, or a bundled object.",
+              estimators=("differences",), moves_silhouettes=True),
+        _moving("coverage", "1", 0.0, 0.9, 0.0,
+                "Share of the object's picture area that it hides; at 0 it is out of the frame.", (0.0, 0.5)),
+        _moving("direction", "degrees", -3600.0, 3600.0, 0.0,
+                "Side of the picture it comes in from: 0 is the right, 90 the top, counter-clockwise.", (0.0, 360.0),
+                periodic=True),
+        _moving("size", "object sizes", 0.05, 5.0, 0.6, "Its largest extent.", (0.3, 1.0), log=True),
+        _moving("distance", "1", 0.1, 0.9, 0.5,
+                "Where between the camera and the object's middle: 0 is the camera, 1 the middle.", (0.3, 0.7)),
+        _moving("turn", "degrees", -3600.0, 3600.0, 0.0, "Rotation of the occluder about its own upright axis.",
+                periodic=True),
     )  # fmt: skip
     choices = (
         Choice("object", None, "Another occluder in place of `which`: any bundled object, or a path to a mesh file."),
@@ -234,21 +208,13 @@ class OcclusionControl(NumberControl):
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """The object as the camera sees it.
+    """The object as the camera sees it."""
 
-    Attributes:
-        directions: (N, 3) in which it is seen, each for the same area of the picture; None if it is not in it.
-        shown: (M, 3) directions spread over the whole picture.
-        rim: (K, 3) those at its edge.
-        near: distance of its nearest vertex from the camera.
-        far: distance of the middle of its bounding box.
-    """
-
-    directions: Doubles | None
-    shown: Doubles
-    rim: Doubles
-    near: float
-    far: float
+    directions: Doubles | None  # (N, 3) in which it is seen, each for the same area; None if it is not in the picture
+    shown: Doubles  # (M, 3) directions spread over the whole picture
+    rim: Doubles  # (K, 3) those at its edge
+    near: float  # distance of its nearest vertex from the camera
+    far: float  # distance of the middle of its bounding box
 
     @staticmethod
     def of(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> _Seen:
@@ -267,9 +233,9 @@ class _Seen:
             fov = float(_numpy(so_far, "camera.fov", np.array([scene.number("camera.fov")]))[0])
             shift = _numpy(so_far, "camera.shift", np.zeros(2))
             frame = silhouettes.Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
-            found = silhouettes.silhouette(points, mesh.faces, frame)
+            silhouette = silhouettes.silhouette(points, mesh.faces, frame)
             shown, rim = frame.spread(), frame.corners()
-            directions = None if found is None else found.directions()
+            directions = None if silhouette is None else silhouette.directions()
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
         near, far = float(np.linalg.norm(points, axis=1).min()), float(np.linalg.norm(middle))
         return _Seen(directions, shown, rim, near, far)

@@ -14,9 +14,8 @@ plane, unrolled along the direction in which the surface bends (exact for cylind
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
@@ -27,35 +26,19 @@ import torch.nn.functional as F
 from scipy import spatial
 from torch import Tensor
 
-from advsearch.controls.base import (
-    LARGEST_EPSILON,
-    NOTHING,
-    WHOLE_RANGE,
-    Budget,
-    Choice,
-    Fixed,
-    Moved,
-    Number,
-    OneOf,
-    Parameter,
-    Spec,
-    Value,
-    change_in_colour,
-    in_words,
-    number,
-)
+from advsearch.controls.base import LARGEST_EPSILON, NOTHING, Choice, Control, Moved, Value, Values, changed, number
 from advsearch.controls.corruption_filters import picture, planes, resized
-from advsearch.controls.numbers import NumberControl, Slot, Values
-from advsearch.controls.ranges import Range
+from advsearch.controls.ranges import Fixed, OneOf, Range, Slot, Spec
 from advsearch.controls.texture import radius, resampled
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import Doubles, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.gradients import WHOLE_RANGE, Budget
 from advsearch.scene.importing.pictures import read_picture
-from advsearch.scene.raster import Charts, MeshSurface, rasterised
-from advsearch.scene.settings import LIT
+from advsearch.scene.raster import MeshSurface, rasterised
+from advsearch.scene.settings import LIT, Parameter
 
 BASE_COLOR = "object.base_color"
 NORMS = ("box", "linf", "l2")
@@ -67,39 +50,37 @@ FACING = (0.1, 0.3)  # cosines between the surface and the square's normal betwe
 EDGE_TEXELS = 2.0  # width of the soft edge in texels
 
 
-class PictureControl(NumberControl):
-    """A control of a picture, searched or from a file, and of numbers, which are fixed where they are not given.
+class PictureControl(Control):
+    """A control of a picture, searched or from a file, and of numbers, which are fixed where they are not given."""
 
-    Attributes:
-        shown: the parameter that is the picture.
-    """
-
-    shown: ClassVar[str]
+    shown: ClassVar[str]  # the parameter that is the picture
+    _picture: Tensor | None
 
     @property
-    @abstractmethod
     def sides(self) -> tuple[int, int]:
         """Rows and columns of the picture."""
+        return (int(self.chosen["resolution"]),) * 2
 
     @property
     def free(self) -> bool:
         """Whether the picture is searched."""
         return self.chosen["picture"] is None and not isinstance(self.specs.get(self.shown), Fixed)
 
-    def size(self, parameter: Parameter) -> int:
-        return 3 * math.prod(self.sides) if parameter.shape else 1
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        return replace(parameter, shape=(*self.sides, 3), default=0.0) if parameter.name == self.shown else parameter
 
-    def spec(self, parameter: Parameter, value: Number) -> Spec:
-        if parameter.name == self.shown:
-            return self.specs.get(self.shown, Range(0.0, 1.0) if self.free else Fixed(0.0))
-        return self.specs.get(parameter.name, Fixed(value))
+    def spec(self, parameter: Parameter) -> Spec:
+        picture = Range(0.0, 1.0) if self.free else Fixed(0.0)
+        return self.specs.get(parameter.name, picture if parameter.name == self.shown else Fixed(parameter.default))
+
+    def values(self, u: Tensor) -> dict[str, Tensor]:
+        values, picture = super().values(u), self._picture
+        shown = values[self.shown].reshape(*self.sides, 3) if picture is None else picture.to(u.device, copy=True)
+        return values | {self.shown: shown}
 
     def read_picture(self) -> Tensor | None:
-        """Return the picture (h, w, 3) sRGB that was chosen; None where none was.
-
-        Raises:
-            FileFormatError: it cannot be read.
-        """
+        """Return the picture (h, w, 3) sRGB that was chosen; None where none was. Raises FileFormatError: it cannot be
+        read."""
         if self.chosen["picture"] is None:
             return None
         try:
@@ -112,48 +93,36 @@ class PictureControl(NumberControl):
         if not self.free:
             return described
         here, start = (self.values(at)[self.shown] for at in (u.detach(), self.start.to(u.device)))
-        return {**change_in_colour(self.name, here - start), **described}
+        return {**changed(self.name, here - start), **described}
 
 
 class PatchControl(PictureControl):
-    """A printed square stuck onto the object: numbers that are not given are fixed, and pixels are searched unless they
-    are a grey or a picture."""
+    """A printed square stuck onto the object: its pixels, place, size and turn.
+
+    Numbers that are not given are fixed, and pixels are searched unless they are a grey or a picture.
+    """
 
     kind = "patch"
     shown = "pixels"
-    summary = "A printed square stuck onto the object: its pixels, place, size and turn."
     parameters = (
-        Parameter(
-            "pixels", (None, None, 3), "sRGB", 0.0, 1.0, "the object's own texture underneath",
-            "Display-referred colours of the patch; a narrower range is a printer's gamut.", search=(0.0, 1.0),
-            estimators=("adjoint",),
-        ),
-        number(
-            ("differences",), "azimuth", "degrees", 0.0, 360.0, "towards the camera",
-            "Side of the object that the patch is on.", periodic=True,
-        ),
-        number(
-            ("differences",), "height", "1", 0.0, 1.0, "towards the camera",
-            "Where it is from the middle of the underside (0) over the sides (0.5) to the middle of the top (1).",
-        ),
+        Parameter("pixels", (None, None, 3), "sRGB", 0.0, 1.0, "the object's own texture underneath",
+                  "Display-referred colours of the patch; a narrower range is a printer's gamut.", search=(0.0, 1.0),
+                  estimators=("adjoint",)),
+        number(("differences",), "azimuth", "degrees", 0.0, 360.0, "towards the camera",
+               "Side of the object that the patch is on.", periodic=True),
+        number(("differences",), "height", "1", 0.0, 1.0, "towards the camera",
+               "Where it is from the middle of the underside (0) over the sides (0.5) to the middle of the top (1)."),
         number(LIT, "size", "object sizes", 0.05, 0.6, 0.3, "Side of the patch.", log=True),
-        number(
-            LIT, "rotation", "degrees", -180.0, 180.0, 0.0,
-            "Turn of the patch on the surface, counter-clockwise; upright at 0.", periodic=True,
-        ),
+        number(LIT, "rotation", "degrees", -180.0, 180.0, 0.0,
+               "Turn of the patch on the surface, counter-clockwise; upright at 0.", periodic=True),
     )  # fmt: skip
     choices = (
         Choice("resolution", 32, "Side of the patch in pixels.", whole=(2, 512)),
-        Choice(
-            "norm", "box",
-            "How far pixels may go: box (anywhere), linf (the default with an epsilon) or l2 (a ball around what is "
-            "underneath).",
-            "norm", "pixels", options=NORMS,
-        ),
-        Choice(
-            "epsilon", None, "Radius of that ball, display-referred; by default 0.1 a pixel value.", "epsilon",
-            "pixels", most=LARGEST_EPSILON,
-        ),
+        Choice("norm", "box",
+               "How far pixels may go: box (anywhere), linf (the default with an epsilon) or l2 (a ball around what "
+               "is underneath).", "norm", "pixels", options=NORMS),
+        Choice("epsilon", None, "Radius of that ball, display-referred; by default 0.1 a pixel value.", "epsilon",
+               "pixels", most=LARGEST_EPSILON),
         Choice("picture", None, "A picture file to stick on as it is; then pixels are not searched.", fixes="pixels"),
     )  # fmt: skip
 
@@ -186,22 +155,19 @@ class PatchControl(PictureControl):
 
     # ---- in a scene -------------------------------------------------------------------------------------------------
 
-    @property
-    def sides(self) -> tuple[int, int]:
-        return (int(self.chosen["resolution"]),) * 2
-
-    def default(self, parameter: Parameter) -> Number:
-        if parameter.name in ("azimuth", "height"):
-            return towards_camera(self.scene)[parameter.name == "height"]
-        return 0.0 if parameter.name == "pixels" else parameter.default  # what is underneath takes their place
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        if parameter.name not in ("azimuth", "height"):
+            return super().in_scene(parameter)
+        return replace(parameter, default=towards_camera(self.scene)[parameter.name == "height"])
 
     def budget_of(self, parameter: Parameter) -> Budget:
         norm = self.chosen["norm"]
         if parameter.name != "pixels" or norm == "box":
             return WHOLE_RANGE
-        spec = self.specs.get("pixels", Range(0.0, 1.0))
+        spec = self.spec(parameter)
         assert isinstance(spec, Range)
-        return Budget(norm, radius(norm, self.chosen["epsilon"], self.size(parameter)) / (spec.high - spec.low))
+        reach = radius(norm, self.chosen["epsilon"], 3 * math.prod(self.sides))
+        return Budget(norm, reach / (spec.high - spec.low))
 
     def fit(self) -> None:
         super().fit()
@@ -219,17 +185,11 @@ class PatchControl(PictureControl):
             wanted = (self._sticker.underneath() - low) / (high - low)
             self.start[: pixels.width] = wanted.clamp(0.0, 1.0).reshape(-1)
             moved = not torch.allclose(wanted.clamp(0.0, 1.0), wanted, atol=1e-5)
-            nearest = f"the nearest {in_words(pixels.spec)}"
+            nearest = f"the nearest {pixels.spec}"
             self.moved = (Moved(self.name, f"{self.name}.pixels", "sRGB", "the texture underneath", nearest),) * moved
 
     def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:
         return super().left_out(() if self.free else slots[1:])  # at the start searched pixels show no patch
-
-    def values(self, u: Tensor) -> dict[str, Tensor]:
-        values = super().values(u)
-        if self._picture is not None:
-            return values | {"pixels": self._picture.to(u.device, copy=True)}
-        return values | {"pixels": values["pixels"].reshape(*self.sides, 3)}
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {BASE_COLOR: self._sticker.paint(so_far.get(BASE_COLOR), values["pixels"], values)}
@@ -269,19 +229,12 @@ def _shape(mesh: Mesh) -> tuple[Doubles, float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """A place for a patch: the texels that it may cover and their coordinates around it.
+    """A place for a patch: the texels that it may cover and their coordinates around it."""
 
-    Attributes:
-        texels: (N,) their numbers, row by row.
-        flat: (N, 2) their coordinates to the right and upwards, object sizes.
-        cover: (N,) in [0, 1]: how much they face the patch.
-        spacing: distance between neighbouring texels on the surface, object sizes.
-    """
-
-    texels: Tensor
-    flat: Tensor
-    cover: Tensor
-    spacing: float
+    texels: Tensor  # (N,) their numbers, row by row
+    flat: Tensor  # (N, 2) their coordinates to the right and upwards, object sizes
+    cover: Tensor  # (N,) in [0, 1]: how much they face the patch
+    spacing: float  # distance between neighbouring texels on the surface, object sizes
 
 
 class Sticker:
@@ -298,7 +251,14 @@ class Sticker:
         self._resting, self._side = resting, side
         self._surface = MeshSurface(mesh)
         own = srgb_to_linear(torch.from_numpy(scene.object.base_color.copy()))
-        charts = _fine_enough(mesh, max(own.shape[:2]), resting["size"] / side)
+        smallest, largest = BASE_SIDES
+        least = wanted = max(smallest, *own.shape[:2])  # sides of a map whose texels are smaller than the pixels
+        charts = rasterised(mesh, least)
+        areas = charts.areas()
+        spacing = math.sqrt(float(np.median(areas[areas > 0.0])))
+        while 2 * wanted <= largest and spacing * least / wanted > resting["size"] / side:
+            wanted *= 2
+        charts = charts if wanted == least else rasterised(mesh, wanted)
         self._own = _fitted(own, len(charts.face))
         mask = charts.touched
         self._texels, self._faces = np.flatnonzero(mask), charts.face[mask]
@@ -363,12 +323,10 @@ class Sticker:
         normal = total / length if length > 1e-12 else normal
         level = math.hypot(outwards[0], outwards[1])
         upwards = np.array([-outwards[2] * math.cos(angle), -outwards[2] * math.sin(angle), level])
-        return self._around(face, point, _frame(side * normal, upwards), side, REACH * size)
-
-    def _around(self, face: int, point: Doubles, frame: Doubles, side: float, radius: float) -> Spot:
-        chosen = np.flatnonzero(self._surface.region(face, point, side * frame[2], radius)[self._faces])
+        frame, reach = _frame(side * normal, upwards), REACH * size
+        chosen = np.flatnonzero(self._surface.region(face, point, side * frame[2], reach)[self._faces])
         offsets = self._positions[chosen] - point
-        close = (offsets**2).sum(axis=1) <= radius**2
+        close = (offsets**2).sum(axis=1) <= reach**2
         chosen, offsets = chosen[close], offsets[close]
         flat, cosine = unrolled(offsets, side * self._normals[chosen], frame)
         low, high = FACING
@@ -379,20 +337,6 @@ class Sticker:
             _smooth(torch.from_numpy(((cosine - low) / (high - low)).astype(np.float32))),
             math.sqrt(float(np.median(areas[areas > 0.0]))) if (areas > 0.0).any() else 1.0 / len(self._own),
         )
-
-
-def _fine_enough(mesh: Mesh, own: int, pixel: float) -> Charts:
-    """Rasterise the charts at the side of a base-colour map whose texels are smaller than the square's pixels, whose
-    side is `pixel` object sizes; `own` is the side of the object's own map."""
-    smallest, largest = BASE_SIDES
-    side = max(smallest, own)
-    charts = rasterised(mesh, side)
-    areas = charts.areas()
-    spacing = math.sqrt(float(np.median(areas[areas > 0.0])))
-    wanted = side
-    while 2 * wanted <= largest and spacing * side / wanted > pixel:
-        wanted *= 2
-    return charts if wanted == side else rasterised(mesh, wanted)
 
 
 def _frame(normal: Doubles, upwards: Doubles) -> Doubles:

@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Number, OneOf, Parameter, Spec, Value, measure
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named
 from advsearch.controls.pose import euler
+from advsearch.controls.ranges import OneOf, Spec
 from advsearch.described import rounded
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text
@@ -38,8 +38,7 @@ CAMERA, THING = MOVERS = "camera", "object"
 BOTH = "+"  # between the camera's path and the object's
 SEVERAL, WAY = ",", "way"  # between paths of which one is drawn, and the parameter that says which
 MOST_PATHS = 64
-CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}
-"""Share of the time at which the scene is as it is described."""
+CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}  # share of the time at which the scene is as it is described
 
 REACH, SECONDS = 4.0, 10.0
 SHORTEST, LONGEST = 1e-3, 3600.0  # seconds between waypoints at least, and of a path at most
@@ -55,22 +54,13 @@ FARTHEST = 1e5  # metres, or object sizes, that a waypoint may be away
 
 @dataclass(frozen=True, eq=False)
 class Waypoints:
-    """A way from a file.
+    """A way from a file; lengths are in metres where the object's size is known, in object sizes elsewhere."""
 
-    Attributes:
-        times: (n,) ascending, seconds from the first.
-        places: (n, 3) from the middle of where the object stands, in metres where its size is known, in object sizes
-            elsewhere; of an object that moves, its shift.
-        targets: (n, 3) what the camera looks at, from the same middle; None for the middle itself.
-        headings: (n,) degrees that the object is turned by; None for none.
-        notes: sentences about how it is read.
-    """
-
-    times: Tensor
-    places: Tensor
-    targets: Tensor | None
-    headings: Tensor | None
-    notes: tuple[str, ...] = ()
+    times: Tensor  # (n,) ascending, seconds from the first
+    places: Tensor  # (n, 3) from the middle of where the object stands; of an object that moves, its shift
+    targets: Tensor | None  # (n, 3) what the camera looks at, from the same middle; None for the middle itself
+    headings: Tensor | None  # (n,) degrees that the object is turned by; None for none
+    notes: tuple[str, ...] = ()  # sentences about how it is read
 
     def at(self, time: Tensor, of: Tensor) -> Tensor:
         """Return a column, or several, at times (...,), linear between waypoints; differentiable in the times."""
@@ -88,35 +78,28 @@ class Start(NamedTuple):
     object: Tensor
 
 
-Way = str | Waypoints
-"""One of `PATHS`, or that of a file."""
+Way = str | Waypoints  # one of `PATHS`, or that of a file
 
-Ways = Mapping[str, Way]
-"""What the camera, the object or both do, by `MOVERS`."""
+Ways = Mapping[str, Way]  # what the camera, the object or both do, by `MOVERS`
 
 
-class PathControl(NumberControl):
-    """The camera, the object or both travel along a path."""
+class PathControl(Control):
+    """The camera, the object or both travel along a path; a frame is a time."""
 
     kind = "path"
-    summary = "The camera, the object or both travel along a path; a frame is a time."
     parameters = (
         moving(ORBIT, "time", "s", 0.0, LONGEST, "where the scene is as it is", "Time since the path began."),
     )
     choices = (
-        Choice(
-            "path", APPROACH,
-            "approach (straight up to where it stands), pass (straight past it), orbit (once around), or a .csv file "
-            "with columns time, x, y, z. Two of them with a + between: the camera's and the object's. Several with "
-            "commas between: each configuration has one of them, `way`.", "path",
-        ),
+        Choice("path", APPROACH,
+               "approach (straight up to where it stands), pass (straight past it), orbit (once around), or a .csv "
+               "file with columns time, x, y, z. Two of them with a + between: the camera's and the object's. Several "
+               "with commas between: each configuration has one of them, `way`.", "path"),
         Choice("moves", CAMERA, "What travels along a single path: camera or object.", options=MOVERS),
         Choice("seconds", SECONDS, "How long it takes; a file says so itself.", most=LONGEST),
-        Choice(
-            "reach", REACH,
-            "How far it goes, in distances of the scene's own camera: where approach begins, half of what pass takes.",
-            most=1000.0,
-        ),
+        Choice("reach", REACH,
+               "How far it goes, in distances of the scene's own camera: where approach begins, half of what pass "
+               "takes.", most=1000.0),
         Choice("shutter", None, "Seconds that each row is exposed: motion blur.", "shutter", most=60.0),
         Choice("rolling", None, "Seconds in which the rows are read, one after the other.", "rolling", most=60.0),
     )  # fmt: skip
@@ -127,10 +110,7 @@ class PathControl(NumberControl):
         names = _names(settings.get("path", APPROACH)) if isinstance(settings, Mapping) else ()
         if len(names) < 2:
             return cls.parameters
-        which = Parameter(
-            WAY, (), "name", 0.0, float(len(names) - 1), names[0], "Which of the paths.", options=names, estimators=()
-        )
-        return *cls.parameters, which
+        return *cls.parameters, named(WAY, names, names[0], "Which of the paths.")
 
     def check_choices(self) -> None:
         names = _names(self.chosen["path"])
@@ -147,7 +127,8 @@ class PathControl(NumberControl):
                 asked = self.chosen["path"]
                 raise InputError(f"{self.name}: {setting}: the file in {asked} says that itself; leave it out")
         if self._files:
-            self.chosen["seconds"] = max(float(one.times[-1]) for one in self._files)
+            self.chosen["seconds"] = max(float(way.times[-1]) for way in self._files)
+        self.seconds = float(self.chosen["seconds"])  # how long the path takes
 
     def _read(self, name: str) -> Ways:
         """What a path makes of camera and object."""
@@ -159,14 +140,14 @@ class PathControl(NumberControl):
                 f"{APPROACH}{BOTH}{TURN}, the camera's and the object's, got {name!r}"
             )
         ways: dict[str, Way] = {}
-        for mover, one in zip([str(self.chosen["moves"])] if alone else MOVERS, names, strict=True):
-            ways |= {mover: one} if one in PATHS else read_waypoints(Path(one), mover, alone=alone)
+        for mover, part in zip([str(self.chosen["moves"])] if alone else MOVERS, names, strict=True):
+            ways |= {mover: part} if part in PATHS else read_waypoints(Path(part), mover, alone=alone)
         return ways
 
-    def spec(self, parameter: Parameter, value: Number) -> Spec:
+    def spec(self, parameter: Parameter) -> Spec:
         if parameter.name == WAY and WAY not in self.specs:  # whatever else is asked for
             return OneOf(parameter.options)
-        return super().spec(parameter, value)
+        return super().spec(parameter)
 
     _later = 0.0
 
@@ -179,11 +160,6 @@ class PathControl(NumberControl):
         then = copy.copy(self)
         then._later = self._later + seconds
         return then
-
-    @property
-    def seconds(self) -> float:
-        """How long the path takes."""
-        return float(self.chosen["seconds"])
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         if CAMERA in self._movers and scene.camera != ORBIT_CAMERA:
@@ -208,7 +184,7 @@ class PathControl(NumberControl):
         """Refuse a path on which the camera is at what it looks at, at a waypoint or between two."""
         files = [way.times for way in ways.values() if isinstance(way, Waypoints)]
         time = torch.cat([torch.linspace(0.0, self.seconds, LOOKS), *files]).unique()
-        begin = self._start(time)
+        begin = start_of(self.scene, time.device)
         place, target = self._camera(ways, begin, time, self._object(ways, begin, time)[0])
         gap = (target - place).expand(len(time), 3).double()
         step = gap[1:] - gap[:-1]
@@ -223,22 +199,18 @@ class PathControl(NumberControl):
                 "look_z)"
             )
 
-    def default(self, parameter: Parameter) -> float | str:
+    def in_scene(self, parameter: Parameter) -> Parameter:
         if parameter.name == WAY:
-            return parameter.options[0]
+            return parameter
         first, *last = self._paths[0].values()
         way = last[0] if last and first == TURN else first  # who goes around is back at the end
-        return CLEAN_AT.get(way, 0.0) * self.seconds if isinstance(way, str) else 0.0
-
-    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
-        return 0.0, self.seconds
-
-    def estimators(self, parameter: Parameter) -> tuple[str, ...]:
-        return ORBIT if CAMERA in self._movers else GEOMETRIC
+        clean = CLEAN_AT.get(way, 0.0) * self.seconds if isinstance(way, str) else 0.0
+        estimators = ORBIT if CAMERA in self._movers else GEOMETRIC
+        return replace(parameter, default=clean, search=(0.0, self.seconds), estimators=estimators)
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         time, ways = values["time"] + self._later, self._ways(values)
-        start = self._start(time)
+        start = start_of(self.scene, time.device)
         shift, heading = self._object(ways, start, time)
         inputs = {}
         if CAMERA in self._movers:
@@ -249,7 +221,7 @@ class PathControl(NumberControl):
         return inputs
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        time, start, ways = values["time"], self._start(values["time"]), self._ways(values)
+        time, start, ways = values["time"], start_of(self.scene, values["time"].device), self._ways(values)
         shift, _ = self._object(ways, start, time)
         away = self._camera(ways, start, time, shift)[0] - start.middle - shift
         unit = "object sizes" if self.scene.object.metres is None else "metres"
@@ -257,10 +229,6 @@ class PathControl(NumberControl):
 
     def _ways(self, values: Values) -> Ways:
         return self._paths[int(values[WAY])] if WAY in values else self._paths[0]
-
-    def _start(self, time: Tensor) -> Start:
-        """How the scene stands, on the device of a time."""
-        return Start(*(one.to(time.device) for one in _start_of(self.scene)))
 
     def _camera(self, ways: Ways, begin: Start, time: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Where the camera is, and what it looks at: an object that is shifted, unless a file says something else."""
@@ -301,9 +269,10 @@ class PathControl(NumberControl):
 
 
 @lru_cache(maxsize=4)
-def _start_of(scene: SceneDescription) -> Start:  # which takes a look at every vertex
+def start_of(scene: SceneDescription, device: torch.device) -> Start:
+    """Return how a scene stands; kept in memory, as it takes a look at every vertex."""
     poses = camera_to_world(scene), middle(scene), object_to_world(scene)
-    return Start(*(torch.from_numpy(one).float() for one in poses))
+    return Start(*(torch.from_numpy(pose).float().to(device) for pose in poses))
 
 
 def _level(along: Tensor) -> Tensor:
@@ -367,7 +336,7 @@ def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, W
     except OSError as error:
         raise FileFormatError(f"{path}: expected a table of waypoints, got {error.strerror}") from error
     try:
-        header, *rows = [[one.strip() for one in row] for row in csv.reader(text.splitlines()) if any(row)] or [[]]
+        header, *rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines()) if any(row)] or [[]]
     except csv.Error as error:
         raise FileFormatError(f"{path}: expected a table of waypoints, got one with a {error}") from error
     columns, parts = (TIME, *PLACE), [0 < len({*group} & {*header}) < len(group) for group in (LOOKING, SHIFT)]
@@ -392,22 +361,22 @@ def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, W
     if not all(np.abs(one).max() <= FARTHEST for one in column.values()):
         raise FileFormatError(f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none")
 
-    def several(*names: str) -> Tensor | None:
+    notes = dict[str, tuple[str, ...]]()
+    for heading in [name for name in (HEADING, TURNING) if name in column]:
+        column[heading], note = the_shorter_way(column[heading])
+        notes[heading] = (f"{path}: {heading}: {note}",) if note else ()
+
+    def read(*names: str) -> Tensor | None:
         if names[0] not in column:
             return None
-        return torch.from_numpy(np.stack([column[one] for one in names], axis=1).astype(np.float32))
+        values = np.stack([column[name] for name in names], axis=1).astype(np.float32)
+        return torch.from_numpy(values if len(names) > 1 else values[:, 0])
 
-    def way(places: Tensor, targets: Tensor | None, heading: str) -> Waypoints:
-        seconds = torch.from_numpy(times.astype(np.float32))
-        if heading not in column:
-            return Waypoints(seconds, places, targets, None)
-        around, note = the_shorter_way(column[heading])
-        told = (f"{path}: {heading}: {note}",) if note else ()
-        return Waypoints(seconds, places, targets, torch.from_numpy(around.astype(np.float32)), told)
-
-    places, shift = several(*PLACE), several(*SHIFT)
+    places, seconds = read(*PLACE), torch.from_numpy(times.astype(np.float32))
     assert places is not None
-    found = {mover: way(places, several(*LOOKING), HEADING)}
+    ways = {mover: Waypoints(seconds, places, read(*LOOKING), read(HEADING), notes.get(HEADING, ()))}
+    shift = read(*SHIFT)
     if shift is not None or TURNING in column:
-        found[THING] = way(torch.zeros_like(places) if shift is None else shift, None, TURNING)
-    return found
+        shift = torch.zeros_like(places) if shift is None else shift
+        ways[THING] = Waypoints(seconds, shift, None, read(TURNING), notes.get(TURNING, ()))
+    return ways

@@ -15,26 +15,22 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Parameter
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Parameter, Values
 from advsearch.errors import InputError
 from advsearch.scene.geometry import affine, standing
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import GEOMETRIC, POSE
 
 
-class PoseControl(NumberControl):
+class PoseControl(Control):
     """Where the object stands, how it is turned, and how large it is."""
 
     kind = "pose"
     of_a_mesh = True
-    summary = "Where the object stands, how it is turned, and how large it is."
     parameters = (
         *POSE[:3],
-        Parameter(
-            "rotation", (3,), "degrees", -180.0, 180.0, 0.0, "Rotation vector on top of the angles.",
-            moves_silhouettes=True, estimators=GEOMETRIC,
-        ),
+        Parameter("rotation", (3,), "degrees", -180.0, 180.0, 0.0, "Rotation vector on top of the angles.",
+                  moves_silhouettes=True, estimators=GEOMETRIC),
         *POSE[3:],
     )  # fmt: skip
     choices = (

@@ -23,30 +23,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.controls.base import (
-    LARGEST_EPSILON,
-    WHOLE_RANGE,
-    Budget,
-    Choice,
-    Fixed,
-    Number,
-    Parameter,
-    Value,
-    measure,
-    number,
-)
+from advsearch.controls.base import LARGEST_EPSILON, Choice, Value, Values, measure, number
 from advsearch.controls.corruption_filters import picture, planes
-from advsearch.controls.numbers import Values
 from advsearch.controls.patch import PRINT_SIDE, PictureControl, enlarged
-from advsearch.controls.ranges import Range
+from advsearch.controls.ranges import Fixed, Range
 from advsearch.controls.texture import NORMS, radius
 from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import METERED_WHITE, WHITE, metered_gain, to_8_bit
 from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middle
+from advsearch.scene.gradients import WHOLE_RANGE, Budget
 from advsearch.scene.parts import ProjectorPart
-from advsearch.scene.settings import LIT, moving
+from advsearch.scene.settings import LIT, Parameter, moving
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -63,61 +52,46 @@ _lit, _moving = partial(number, LIT), partial(moving, ("differences",))
 
 
 class ProjectorControl(PictureControl):
-    """A picture thrown onto the object: its texels are searched, and numbers where they get a range."""
+    """A picture that a projector throws onto the object.
+
+    Its texels are searched, and numbers where they get a range.
+    """
 
     part: ProjectorPart
     _later = 0.0
     kind = "projector"
     shown = "pattern"
-    summary = "A picture that a projector throws onto the object."
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter(
-            "pattern", (None, None, 3), "sRGB", 0.0, 1.0, "black, or grey",
-            "Display-referred texels of the picture, rounded to 8 bits.", search=(0.0, 1.0), estimators=("adjoint",),
-        ),
-        _moving(
-            "azimuth", "degrees", -3600.0, 3600.0, f"{BESIDE:g} from the camera",
-            "Direction of the projector around the object.", periodic=True,
-        ),
+        Parameter("pattern", (None, None, 3), "sRGB", 0.0, 1.0, "black, or grey",
+                  "Display-referred texels of the picture, rounded to 8 bits.", search=(0.0, 1.0),
+                  estimators=("adjoint",)),
+        _moving("azimuth", "degrees", -3600.0, 3600.0, f"{BESIDE:g} from the camera",
+                "Direction of the projector around the object.", periodic=True),
         _moving("elevation", "degrees", -89.0, 89.0, "the camera's", "Height of the projector above the ground plane."),
-        _moving(
-            "distance", "object sizes", 0.01, 1e4, "the camera's",
-            "Distance to the object's middle; in metres where the object's size is known.", log=True,
-        ),
-        _lit(
-            "lumens", "lumens", 0.0, 1e6, f"{LUMENS:g}, or what is {TIMES:g} times as bright as the place",
-            "Light of a white picture.",
-        ),
-        _lit(
-            "ambient", "lux", 1e-3, 2e5, f"the place's, or {AMBIENT:g}",
-            "Light on the object without the projector.", log=True,
-        ),
-        _lit(
-            "black", "1", 0.0, 1.0, 0.0, "Share of white that a black texel still throws: 0.001 at a contrast of 1000."
-        ),
+        _moving("distance", "object sizes", 0.01, 1e4, "the camera's",
+                "Distance to the object's middle; in metres where the object's size is known.", log=True),
+        _lit("lumens", "lumens", 0.0, 1e6, f"{LUMENS:g}, or what is {TIMES:g} times as bright as the place",
+             "Light of a white picture."),
+        _lit("ambient", "lux", 1e-3, 2e5, f"the place's, or {AMBIENT:g}",
+             "Light on the object without the projector.", log=True),
+        _lit("black", "1", 0.0, 1.0, 0.0,
+             "Share of white that a black texel still throws: 0.001 at a contrast of 1000."),
         _lit("blur", "texels", 0.0, 64.0, 0.0, "How far it is out of focus: standard deviation of the blur."),
-        number(
-            ("differences",), "flicker", "Hz", 0.0, 1e5, 0.0,
-            "How often a second it flashes: light in one half of each period; at 0 it does not.",
-        ),
-        number(
-            ("differences",), "phase", "degrees", -3600.0, 3600.0, 0.0,
-            "Where in its period a flashing light is at the time of the picture; up to 180 it is on.", periodic=True,
-        ),
+        number(("differences",), "flicker", "Hz", 0.0, 1e5, 0.0,
+               "How often a second it flashes: light in one half of each period; at 0 it does not."),
+        number(("differences",), "phase", "degrees", -3600.0, 3600.0, 0.0,
+               "Where in its period a flashing light is at the time of the picture; up to 180 it is on.",
+               periodic=True),
     )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("resolution", 64, "Rows of texels.", whole=(2, 512)),
         Choice("aspect", 1.0, "Width of the picture over its height.", most=4.0),
         Choice("fov", None, "Angle of the picture's width, degrees; by default it just covers the object.", most=150.0),
         Choice("start", "black", "What the search begins with: black or grey.", options=("black", "grey")),
-        Choice(
-            "norm", "linf", "Norm of the ball around that start: linf (per texel value) or l2 (over all of them).",
-            "norm", options=NORMS,
-        ),
-        Choice(
-            "epsilon", None, "Radius of that ball, display-referred; by default every picture is inside.", "epsilon",
-            most=LARGEST_EPSILON,
-        ),
+        Choice("norm", "linf", "Norm of the ball around that start: linf (per texel value) or l2 (over all of them).",
+               "norm", options=NORMS),
+        Choice("epsilon", None, "Radius of that ball, display-referred; by default every picture is inside.", "epsilon",
+               most=LARGEST_EPSILON),
         Choice("picture", None, "A picture file to project as it is; then the pattern is not searched.",
                fixes="pattern"),
     )  # fmt: skip
@@ -146,8 +120,12 @@ class ProjectorControl(PictureControl):
         picture = self.read_picture()
         rows = int(self.chosen["resolution"]) if picture is None else len(picture)
         columns = max(2, round(rows * self.chosen["aspect"])) if picture is None else picture.shape[1]
-        there = self.within(scene)
-        part = ProjectorPart(self.name, there._fov(columns / rows), (rows, columns))
+        fov = self.chosen["fov"]
+        if fov is None:  # with which the picture covers the object from where it stands at the start
+            farthest = float(np.linalg.norm(scene.base_vertices - middle(scene), axis=1).max())
+            reach = farthest * max(1.0, columns / rows) * scene.metres
+            fov = min(math.degrees(2.0 * math.atan(reach / self.within(scene)._far())), 150.0)
+        part = ProjectorPart(self.name, float(fov), (rows, columns))
         if scene.environment is None or scene.environment.candelas is None:
             note = (
                 f"The place's brightness has no unit: its light is taken for {AMBIENT:g} lux; "
@@ -157,41 +135,43 @@ class ProjectorControl(PictureControl):
         return scene.with_part(part)
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        metres = parameter.name == "distance" and self.scene.object.metres is not None
-        return replace(parameter, unit="metres") if metres else parameter
+        parameter, scene = super().in_scene(parameter), self.scene
+        away = camera_to_world(scene)[:3, 3] - middle(scene)
+        far = float(np.linalg.norm(away))
+        match parameter.name:
+            case "pattern":
+                return replace(parameter, default=GREY if self.chosen["start"] == "grey" else 0.0)
+            case "ambient":
+                candelas = None if scene.environment is None else scene.environment.candelas
+                lux = AMBIENT if candelas is None else min(max(candelas * ambient_irradiance(scene), 1e-3), 2e5)
+                return replace(parameter, default=lux)
+            case "lumens":
+                bright = TIMES * float(self.resting("ambient")) * self.part.area * self._far() ** 2
+                return replace(parameter, default=min(LUMENS, bright))
+            case "azimuth":
+                return replace(parameter, default=math.degrees(math.atan2(away[1], away[0])) + BESIDE)
+            case "elevation":
+                return replace(parameter, default=min(max(math.degrees(math.asin(away[2] / far)), -89.0), 89.0))
+            case "distance":
+                unit = "object sizes" if scene.object.metres is None else "metres"
+                return replace(parameter, default=far * scene.metres, unit=unit)
+        return parameter
 
     @property
     def sides(self) -> tuple[int, int]:
         return self.part.sides
 
-    def default(self, parameter: Parameter) -> Number:
-        if parameter.name == "pattern":
-            return GREY if self.chosen["start"] == "grey" else 0.0
-        if parameter.name == "ambient":
-            place = self.scene.environment
-            unit = None if place is None else place.candelas
-            return AMBIENT if unit is None else min(max(unit * ambient_irradiance(self.scene), 1e-3), 2e5)
-        if parameter.name == "lumens":
-            return min(LUMENS, TIMES * float(self.default(self.named("ambient"))) * self.part.area * self._far() ** 2)
-        away = camera_to_world(self.scene)[:3, 3] - middle(self.scene)
-        far = float(np.linalg.norm(away))
-        if parameter.name == "azimuth":
-            return math.degrees(math.atan2(away[1], away[0])) + BESIDE
-        if parameter.name == "elevation":
-            return min(max(math.degrees(math.asin(away[2] / far)), -89.0), 89.0)
-        return far * self.scene.metres if parameter.name == "distance" else parameter.default
-
     def _far(self) -> float:
         """How far away it stands at the start."""
         spec = self.specs.get("distance")
-        return float(spec.value if isinstance(spec, Fixed) else self.default(self.named("distance")))
+        return float(spec.value if isinstance(spec, Fixed) else self.resting("distance"))
 
     def budget_of(self, parameter: Parameter) -> Budget:
         if parameter.name != "pattern":
             return WHOLE_RANGE
-        norm, epsilon = self.chosen["norm"], self.chosen["epsilon"]
-        whole = 1.0 if norm == "linf" else math.sqrt(self.size(parameter))
-        return Budget(norm, whole if epsilon is None else radius(norm, epsilon, self.size(parameter)))
+        norm, epsilon, count = self.chosen["norm"], self.chosen["epsilon"], 3 * math.prod(self.sides)
+        whole = 1.0 if norm == "linf" else math.sqrt(count)
+        return Budget(norm, whole if epsilon is None else radius(norm, epsilon, count))
 
     def fit(self) -> None:
         (self.part,) = (part for part in self.scene.parts if isinstance(part, ProjectorPart) and part.name == self.name)
@@ -206,14 +186,6 @@ class ProjectorControl(PictureControl):
             got = f"{picture.shape[1]} x {picture.shape[0]}"
             raise InputError(f"{self.name}.picture: expected at least 2 texels a side, got {got}")
         return picture
-
-    def _fov(self, aspect: float) -> float:
-        """Degrees: what was chosen, or with which the picture covers the object from where it stands at the start."""
-        if self.chosen["fov"] is not None:
-            return float(self.chosen["fov"])
-        vertices = self.scene.base_vertices - middle(self.scene)
-        reach = float(np.linalg.norm(vertices, axis=1).max()) * max(1.0, aspect) * self.scene.metres
-        return min(math.degrees(2.0 * math.atan(reach / self._far())), 150.0)
 
     @property
     def ambient(self) -> float | None:
@@ -238,8 +210,8 @@ class ProjectorControl(PictureControl):
     # ---- at a configuration ------------------------------------------------------------------------------------------
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
-        values, picture = super().values(u), self._picture
-        pattern = values["pattern"].reshape(*self.part.sides, 3) if picture is None else picture.to(u.device)
+        values = super().values(u)
+        pattern = values["pattern"]
         rounded = pattern + (to_8_bit(pattern.detach()) - pattern.detach())  # a projector gets 8 bits
         return values | {"pattern": rounded}
 

@@ -22,10 +22,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.controls.base import Choice, number
+from advsearch.controls.base import Choice, Control, Values, number
 from advsearch.controls.corruption import coded
 from advsearch.controls.corruption_filters import drawn, picture, planes, warped
-from advsearch.controls.numbers import NumberControl, Values
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 
 _DARK = 1e-6  # keeps the slope of a square root finite in black
@@ -34,32 +33,23 @@ _DARK = 1e-6  # keeps the slope of a square root finite in black
 _image = partial(number, ("image",))
 
 
-class SensorControl(NumberControl):
-    """Noise, mosaic, white balance, chromatic aberration and compression of a camera."""
+class SensorControl(Control):
+    """What a camera adds: noise, mosaic, white balance, chromatic aberration, vignetting, JPEG."""
 
     kind = "sensor"
-    summary = "What a camera adds: noise, mosaic, white balance, chromatic aberration, vignetting, JPEG."
     parameters = (
         _image("vignetting", "1", 0.0, 0.95, 0.0, "Share of the light that is missing in the corners."),
-        _image(
-            "aberration", "1", -0.02, 0.02, 0.0, "How much larger the red picture is than the green one; blue smaller.",
-            (-0.005, 0.005),
-        ),
-        _image(
-            "shot", "1", 0.0, 0.5, 0.0, "Standard deviation of the noise in white that grows with the root of light.",
-            (0.0, 0.1),
-        ),
+        _image("aberration", "1", -0.02, 0.02, 0.0,
+               "How much larger the red picture is than the green one; blue smaller.", (-0.005, 0.005)),
+        _image("shot", "1", 0.0, 0.5, 0.0,
+               "Standard deviation of the noise in white that grows with the root of light.", (0.0, 0.1)),
         _image("read", "1", 0.0, 0.2, 0.0, "Standard deviation of the noise that is there in the dark.", (0.0, 0.02)),
-        _image(
-            "mosaic", "1", 0.0, 1.0, 0.0, "Share of the picture that goes through a Bayer mosaic; 1 is a real camera.",
-            (0.0, 1.0),
-        ),
+        _image("mosaic", "1", 0.0, 1.0, 0.0,
+               "Share of the picture that goes through a Bayer mosaic; 1 is a real camera.", (0.0, 1.0)),
         _image("red", "stops", -1.0, 1.0, 0.0, "White balance: red is this much brighter.", (-0.5, 0.5)),
         _image("blue", "stops", -1.0, 1.0, 0.0, "White balance: blue is this much brighter.", (-0.5, 0.5)),
-        number(
-            (), "compression", "1", 0.0, 95.0, 0.0, "0 is no file; above, a JPEG file of quality 100 less this.",
-            (0.0, 60.0),
-        ),
+        number((), "compression", "1", 0.0, 95.0, 0.0, "0 is no file; above, a JPEG file of quality 100 less this.",
+               (0.0, 60.0)),
     )  # fmt: skip
     choices = (Choice("seed", 0, "Which draw of the noise: a whole number from 0.", whole=(0, 2**32 - 1)),)
 

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache, partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Number, Parameter, Value, measure
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure
 from advsearch.controls.occlusion import SURROUNDINGS, camera_in, put_away
 from advsearch.scene.assets import Doubles, Material, Mesh
 from advsearch.scene.description import SceneDescription
@@ -38,38 +38,27 @@ LOW = 5.0  # degrees above the ground that light counts from: lower, the card wo
 _moving = partial(moving, ("differences",))
 
 
-class ShadowControl(NumberControl):
-    """A dark card between the strongest light and the object, that the camera does not see."""
+class ShadowControl(Control):
+    """A dark card that throws a shadow onto the object, out of the camera's sight."""
 
     kind = "shadow"
     amount = "size"
     refines = frozenset(SURROUNDINGS)  # none is changed; but it comes after whatever moves the camera
-    summary = "A dark card that throws a shadow onto the object, out of the camera's sight."
     parameters = (
-        _moving(
-            "x", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow to the right, seen from the light.", (-0.5, 0.5)
-        ),
+        _moving("x", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow to the right, seen from the light.",
+                (-0.5, 0.5)),
         _moving("y", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow upwards.", (-0.5, 0.5)),
         _moving("size", "object sizes", 0.0, 10.0, 0.0, "Radius of the card; at 0 there is none.", (0.0, 0.6)),
-        _moving(
-            "turn", "degrees", -3600.0, 3600.0, 0.0, "Turn of the card, counter-clockwise.", (0.0, 360.0), periodic=True
-        ),
-        Parameter(
-            "radii", (None,), "1", 0.05, 1.0, 1.0, "Radius at each corner, as a share of the size.",
-            moves_silhouettes=True, search=(0.2, 1.0),
-        ),
-        _moving(
-            "azimuth", "degrees", -3600.0, 3600.0, "the strongest light's", "Direction from the object to the card.",
-            periodic=True,
-        ),
-        _moving(
-            "elevation", "degrees", LOW, 90.0, "the strongest light's",
-            "Height of that direction above the ground plane.",
-        ),
-        _moving(
-            "distance", "object sizes", 0.1, 1000.0, 2.0,
-            "From the object's middle to the card; farther where the camera would see it.", log=True,
-        ),
+        _moving("turn", "degrees", -3600.0, 3600.0, 0.0, "Turn of the card, counter-clockwise.", (0.0, 360.0),
+                periodic=True),
+        Parameter("radii", (None,), "1", 0.05, 1.0, 1.0, "Radius at each corner, as a share of the size.",
+                  moves_silhouettes=True, search=(0.2, 1.0)),
+        _moving("azimuth", "degrees", -3600.0, 3600.0, "the strongest light's",
+                "Direction from the object to the card.", periodic=True),
+        _moving("elevation", "degrees", LOW, 90.0, "the strongest light's",
+                "Height of that direction above the ground plane."),
+        _moving("distance", "object sizes", 0.1, 1000.0, 2.0,
+                "From the object's middle to the card; farther where the camera would see it.", log=True),
     )  # fmt: skip
     choices = (Choice("corners", 6, "Corners of the card.", whole=(3, 64)),)
 
@@ -79,37 +68,37 @@ class ShadowControl(NumberControl):
         card = polygon(int(self.chosen["corners"]))
         return scene.with_part(MeshPart(self.name, card, texel, Material(roughness=1.0), to_world=away))
 
-    def size(self, parameter: Parameter) -> int:
-        return int(self.chosen["corners"]) if parameter.shape else 1
-
-    def default(self, parameter: Parameter) -> Number:
-        if parameter.name not in ("azimuth", "elevation"):
-            return parameter.default
-        towards, _ = strongest_light(self.scene)
-        if parameter.name == "azimuth":
-            return math.degrees(math.atan2(towards[1], towards[0]))
-        return max(math.degrees(math.asin(min(towards[2], 1.0))), LOW)
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        x, y, z = strongest_light(self.scene)[0]
+        match parameter.name:
+            case "radii":
+                return replace(parameter, shape=(int(self.chosen["corners"]),))
+            case "azimuth":
+                return replace(parameter, default=math.degrees(math.atan2(y, x)))
+            case "elevation":
+                return replace(parameter, default=max(math.degrees(math.asin(min(z, 1.0))), LOW))
+        return parameter
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         radii = values["radii"]
         rim = torch.from_numpy(polygon(len(radii)).vertices[1:].copy()).to(radii)
         offsets = torch.cat([torch.zeros(1, 3).to(radii), rim * (radii[:, None] - 1.0)])
         far = self._distance(values, so_far)
-        pose = put_away(camera_in(self.scene, so_far).to(radii)) if far is None else self._pose(values, far)
+        if far is None:
+            pose = put_away(camera_in(self.scene, so_far).to(radii))
+        else:
+            right, up, outwards = torch.from_numpy(self._axes(values)).to(values["x"])
+            turn, size = torch.deg2rad(values["turn"]), values["size"].clamp_min(SMALLEST)
+            along = torch.cos(turn) * right + torch.sin(turn) * up
+            across = torch.cos(turn) * up - torch.sin(turn) * right
+            place = torch.from_numpy(middle(self.scene)).to(right) + far * outwards
+            place = place + values["x"] * right + values["y"] * up
+            pose = affine(size * torch.stack([along, -across, -outwards], dim=1), place)
         return {f"{self.name}.to_world": pose, f"{self.name}.offsets": offsets}
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         far = self._distance(values, so_far)
         return {"true_distance": measure(0.0 if far is None else far, "object sizes, 0 where it is put away")}
-
-    def _pose(self, values: Values, far: float) -> Tensor:
-        right, up, outwards = torch.from_numpy(self._axes(values)).to(values["x"])
-        turn = torch.deg2rad(values["turn"])
-        along = torch.cos(turn) * right + torch.sin(turn) * up
-        across = torch.cos(turn) * up - torch.sin(turn) * right
-        place = torch.from_numpy(middle(self.scene)).to(right) + far * outwards + values["x"] * right + values["y"] * up
-        size = values["size"].clamp_min(SMALLEST)
-        return affine(size * torch.stack([along, -across, -outwards], dim=1), place)
 
     def _axes(self, values: Values) -> Doubles:
         """Rows: to the right and upwards as seen from the light, and towards it."""
@@ -117,38 +106,30 @@ class ShadowControl(NumberControl):
         return np.stack([-left, up, outwards])
 
     def _distance(self, values: Values, so_far: Mapping[str, Tensor]) -> float | None:
-        """How far it is, so that the camera does not see it; None where it is put away."""
-        size, asked = (float(values[name].detach()) for name in ("size", "distance"))
+        """How far it is, so that a ball around it is not in the picture: outside of the cone around its corners; None
+        where it is put away."""
+        size, asked, x, y = (float(values[name].detach()) for name in ("size", "distance", "x", "y"))
         if size < SMALLEST:
             return None
         right, up, outwards = self._axes(values)
-        aside = float(values["x"].detach()) * right + float(values["y"].detach()) * up
-        _, lamp = strongest_light(self.scene)
-        for share in np.geomspace(1.0, FARTHEST, STEPS):
-            far = min(asked * share, BELOW_LAMP * lamp)
-            if not self._seen(middle(self.scene) + far * outwards + aside, size, so_far):
-                return float(far)
-        return None
-
-    def _seen(self, place: Doubles, size: float, so_far: Mapping[str, Tensor]) -> bool:
-        """Whether a ball around the card is in the camera's picture: within the cone around its corners."""
+        aside = x * right + y * up
         camera = camera_in(self.scene, so_far).detach().double().cpu().numpy()
-        way = (place - camera[:3, 3]) @ camera[:3, :3]
-        far = float(np.linalg.norm(way))
-        if far <= size:
-            return True
-        model, fov = self.scene.camera_model, so_far.get("camera.fov")
+        model, aspect = self.scene.camera_model, self.scene.aspect
+        fov, shift = so_far.get("camera.fov"), so_far.get("camera.shift")
         if model is not None:
             widest = 2.0 * math.atan(math.hypot(*model.tangents))
         else:
             widest = math.radians(self.scene.number("camera.fov") if fov is None else float(fov.detach()))
-        corner = math.atan(
-            math.tan(min(widest, 3.0) / 2.0) * math.hypot(1.0, min(self.scene.aspect, 1.0 / self.scene.aspect))
-        )
-        shift = so_far.get("camera.shift")
-        if shift is not None:
-            corner += 2.0 * float(shift.detach().abs().max())
-        return math.acos(min(max(way[2] / far, -1.0), 1.0)) - math.asin(size / far) < corner
+        corner = math.atan(math.tan(min(widest, 3.0) / 2.0) * math.hypot(1.0, min(aspect, 1.0 / aspect)))
+        corner += 0.0 if shift is None else 2.0 * float(shift.detach().abs().max())
+        _, lamp = strongest_light(self.scene)
+        for share in np.geomspace(1.0, FARTHEST, STEPS):
+            far = min(asked * share, BELOW_LAMP * lamp)
+            way = (middle(self.scene) + far * outwards + aside - camera[:3, 3]) @ camera[:3, :3]
+            away = float(np.linalg.norm(way))
+            if away > size and math.acos(min(max(way[2] / away, -1.0), 1.0)) - math.asin(size / away) >= corner:
+                return float(far)
+        return None
 
 
 @lru_cache(maxsize=8)

@@ -21,8 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, number
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Values, number
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -148,31 +147,21 @@ METERED_IRRADIANCE = 0.9 * math.pi / 0.8
 """`M`: the irradiance on what faces the sun, the same for every sky that is metered."""
 
 
-class SkyControl(NumberControl):
-    """A sun and a clear sky in place of the environment."""
+class SkyControl(Control):
+    """A clear sky instead of the environment: where the sun stands, and how hazy the air is."""
 
     kind = "sky"
-    summary = "A clear sky instead of the environment: where the sun stands, and how hazy the air is."
     parameters = (
-        number(
-            ("differences",), "azimuth", "degrees", -3600.0, 3600.0, 90.0,
-            "Direction of the sun about the vertical; 0 is +x.", (0.0, 360.0), periodic=True,
-        ),
-        number(
-            ("differences",), "elevation", "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.",
-            (5.0, 85.0),
-        ),
-        number(
-            LIT, "turbidity", "1", *TURBIDITIES, 3.0,
-            "How much the air scatters: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.", (2.0, 8.0),
-        ),
+        number(("differences",), "azimuth", "degrees", -3600.0, 3600.0, 90.0,
+               "Direction of the sun about the vertical; 0 is +x.", (0.0, 360.0), periodic=True),
+        number(("differences",), "elevation", "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.",
+               (5.0, 85.0)),
+        number(LIT, "turbidity", "1", *TURBIDITIES, 3.0,
+               "How much the air scatters: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.", (2.0, 8.0)),
     )  # fmt: skip
-    choices = (
-        Choice(
-            "exposure", "metered", "metered (each sky anew, as an automatic camera does) or fixed (at the start).",
-            options=("metered", "fixed"),
-        ),
-    )  # fmt: skip
+    choices = (Choice("exposure", "metered",
+                      "metered (each sky anew, as an automatic camera does) or fixed (at the start).",
+                      options=("metered", "fixed")),)  # fmt: skip
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         bound = self.bind(scene)
@@ -180,28 +169,24 @@ class SkyControl(NumberControl):
         sky = EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
         return replace(scene, environment=sky).with_values(environment__rotation=0.0, environment__exposure=0.0)
 
+    def fit(self) -> None:
+        super().fit()
+        start = self.values(self.start)
+        numbers = torch.tensor(0.0), start["elevation"], start["turbidity"]  # the sun's azimuth does not matter
+        self._metered = sky_over(self.scene.ground_color, torch.device("cpu"))(*numbers)[1]
+
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {"environment.data": self.radiance(values)}
 
     def radiance(self, values: Values) -> Tensor:
         """Return the map (H, W, 3) of linear radiance at some values; differentiable."""
-        ground = self.scene.ground_color
         numbers = values["azimuth"], values["elevation"], values["turbidity"]
-        radiance, metered = sky_over(ground, numbers[0].device)(*numbers)
-        if self.chosen["exposure"] == "fixed":
-            start = self.values(self.start)
-            metered = metered_at(ground, float(start["elevation"]), float(start["turbidity"])).to(radiance.device)
-        return radiance * (METERED_IRRADIANCE / metered)
+        radiance, metered = sky_over(self.scene.ground_color, numbers[0].device)(*numbers)
+        fixed = self.chosen["exposure"] == "fixed"
+        return radiance * (METERED_IRRADIANCE / (self._metered.to(radiance.device) if fixed else metered))
 
 
 @lru_cache(maxsize=4)
 def sky_over(ground: tuple[float, ...], device: torch.device) -> Sky:
     """Return the sky over a ground of an sRGB colour: far away it is made of the same as the ground plane."""
     return Sky(srgb_to_linear(torch.tensor(ground)).to(device))
-
-
-@lru_cache(maxsize=16)
-def metered_at(ground: tuple[float, ...], elevation: float, turbidity: float) -> Tensor:
-    """Return the metered irradiance () of a sky; the sun's azimuth does not matter."""
-    numbers = (torch.tensor(number) for number in (0.0, elevation, turbidity))
-    return sky_over(ground, torch.device("cpu"))(*numbers)[1]

@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from advsearch.controls.base import NOTHING, Control, Group, Moved, Value
-from advsearch.controls.numbers import NumberControl
 from advsearch.copies import is_ours
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
@@ -23,23 +22,12 @@ VIEWS = 256  # configurations of a camera, a power of two, by which is found how
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Bound controls in the order of their slices.
+    """Bound controls in the order of their slices. InputError: two instances have one name."""
 
-    Attributes:
-        controls: at least none; an empty space renders the scene as it is.
-        scene: the scene with everything in it that the controls need; None leaves it to the caller.
-
-        moved: values of the clean scene that the start has not, because a control leaves them out.
-        environment: what lights the clean scene in the place of its own environment; None if nothing does.
-
-    Raises:
-        InputError: two instances have one name.
-    """
-
-    controls: tuple[Control, ...]
-    scene: SceneDescription | None = None
-    moved: tuple[Moved, ...] = ()
-    environment: str | None = None
+    controls: tuple[Control, ...]  # at least none; an empty space renders the scene as it is
+    scene: SceneDescription | None = None  # with everything in it that the controls need; None leaves it to the caller
+    moved: tuple[Moved, ...] = ()  # values of the clean scene that the start has not, as a control leaves them out
+    environment: str | None = None  # what lights the clean scene in the place of its own environment; None if nothing
 
     def __post_init__(self) -> None:
         names = [control.name for control in self.controls]
@@ -88,14 +76,9 @@ class Space:
         return tuple(sorted(range(len(kinds)), key=kinds.__getitem__))
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
-        """Map u to scene inputs, by differentiable torch operations.
-
-        Controls that refine what others set come later, and those that lie on top last, whatever the order in which
-        they were asked for.
-
-        Raises:
-            InputError: two controls set one input.
-        """
+        """Map u to scene inputs, by differentiable torch operations. Controls that refine what others set come later,
+        and those that lie on top last, whatever the order in which they were asked for. Raises InputError: two controls
+        set one input."""
         parts, merged, set_by = u.split(self.sizes), dict[str, Tensor](), dict[str, str]()
         for number in self._turns:
             control = self.controls[number]
@@ -160,14 +143,8 @@ class Space:
         return replace(self, controls=tuple(control.later(seconds) for control in self.controls))
 
     def holding(self, u: Tensor) -> Space:
-        """Return the space whose first controls stay where a configuration of them has them, so that the others vary.
-
-        Args:
-            u: (d,) of as many whole controls.
-
-        Raises:
-            InputError: no number of controls has so many coordinates.
-        """
+        """Return the space whose first controls stay where a configuration u (d,) of as many has them, so that the
+        others vary. Raises InputError: no number of controls has so many coordinates."""
         sizes = self.sizes
         count = next((k for k in range(len(sizes) + 1) if sum(sizes[:k]) == len(u)), None)
         if count is None:
@@ -178,11 +155,8 @@ class Space:
         return replace(self, controls=(*held, *self.controls[count:]), environment=lit_by)
 
     def lit_by(self, values: Mapping[str, Value]) -> str | None:
-        """Return what lights a configuration in the place of the scene's environment; None if nothing does.
-
-        Args:
-            values: the configuration as it is described.
-        """
+        """Return what lights a configuration, by the values that describe it, in the place of the scene's environment;
+        None if nothing does."""
         for group in self.groups:
             if group.setting == ENVIRONMENT:
                 chosen = str(values[group.name]["value"])
@@ -192,27 +166,27 @@ class Space:
     def notes(self, scene: SceneDescription) -> tuple[str, ...]:
         """Return what a user should know of the scene (without one of its own, of `scene`), and of how far the camera
         goes in it: see `advsearch.scene.validity`."""
-        scene = self.scene or scene
+        scene, views = self.scene or scene, list[CameraView]()
         turns = any(group.setting == "environment.rotation" for group in self.groups)
-        return (*scene.notes, *past(scene, self._views(scene), turns=turns))
-
-    def _views(self, scene: SceneDescription) -> list[CameraView]:
-        """How the camera looks in some configurations, evenly spread, and where a coordinate is at an end."""
-        if surroundings_of(scene) is None:
-            return []
-        for control, start in self.slices(self.start):
-            if not isinstance(control, (NumberControl, _Held)) or "camera.to_world" not in control.inputs(start):
-                continue
-            size = len(start)
-            spread = SobolEngine(size).draw(VIEWS) if size else torch.zeros(1, 0)
-            ends = [torch.where(torch.eye(size) > 0.0, end, 0.5) for end in (0.0, 1.0)]
-            views = []
-            for u in torch.cat([spread, *ends]):
-                inputs = control.inputs(u)
-                fov = float(inputs["camera.fov"]) if "camera.fov" in inputs else None
-                views.append(view_of(scene, inputs["camera.to_world"].detach().double().numpy(), fov))
-            return views
-        return [view_of(scene)]
+        if surroundings_of(scene) is not None:
+            views = [view_of(scene)]
+            for control, start in self.slices(self.start):
+                if not (control.slots or isinstance(control, _Held)) or "camera.to_world" not in control.inputs(start):
+                    continue
+                size = len(start)
+                spread = SobolEngine(size).draw(VIEWS) if size else torch.zeros(1, 0)
+                ends = [torch.where(torch.eye(size) > 0.0, end, 0.5) for end in (0.0, 1.0)]  # of each coordinate
+                inputs = [control.inputs(u) for u in torch.cat([spread, *ends])]
+                views = [
+                    view_of(
+                        scene,
+                        seen["camera.to_world"].detach().double().numpy(),
+                        float(seen["camera.fov"]) if "camera.fov" in seen else None,
+                    )
+                    for seen in inputs
+                ]
+                break
+        return (*scene.notes, *past(scene, views, turns=turns))
 
     def artifacts(self, u: Tensor) -> dict[str, Tensor]:
         """Return the pictures worth keeping of a configuration, by file stem."""

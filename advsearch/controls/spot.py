@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Number, Parameter, Value, measure, number
-from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.base import Choice, Control, Parameter, Value, Values, color_of, measure, number
 from advsearch.controls.projector import LUMENS, TIMES, ProjectorControl
-from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.settings import CHANNELS, LIT, colors
+from advsearch.controls.ranges import Number
+from advsearch.scene.settings import LIT, colors
 
 OF_THE_SOURCE = ("azimuth", "elevation", "distance", "ambient", "flicker", "phase")
 WIDTH = 0.3  # object sizes
@@ -30,25 +30,19 @@ _lit = partial(number, LIT)
 
 
 class SpotControl(ProjectorControl):
-    """A round spot of light on the object: where it falls, how wide, in which colour and how bright."""
+    """The spot of a torch or a laser on the object."""
 
     kind = "spot"
     amount = "lumens"
-    summary = "The spot of a torch or a laser on the object."
     parameters = (
-        _lit(
-            "x", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle to the right, seen from the light.", (-0.5, 0.5)
-        ),
+        _lit("x", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle to the right, seen from the light.",
+             (-0.5, 0.5)),
         _lit("y", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle upwards.", (-0.5, 0.5)),
-        _lit(
-            "width", "object sizes", 0.02, 10.0, WIDTH, "Diameter in which half of its light falls.", (0.05, 0.6),
-            log=True,
-        ),
+        _lit("width", "object sizes", 0.02, 10.0, WIDTH, "Diameter in which half of its light falls.", (0.05, 0.6),
+             log=True),
         *colors("of its light.", (0.0, 1.0)),
-        _lit(
-            "lumens", "lumens", 0.0, 1e6, "0, or what is 20 times as bright as the place", "All of its light.",
-            (0.0, LUMENS),
-        ),
+        _lit("lumens", "lumens", 0.0, 1e6, "0, or what is 20 times as bright as the place", "All of its light.",
+             (0.0, LUMENS)),
         *(parameter for parameter in ProjectorControl.parameters if parameter.name in OF_THE_SOURCE),
     )  # fmt: skip
     choices = (
@@ -57,27 +51,23 @@ class SpotControl(ProjectorControl):
     )
 
     # its numbers are a handful, and there is no picture among them
-    size, spec, budget_of = NumberControl.size, NumberControl.spec, NumberControl.budget_of
-    values, describe, kept_pictures = NumberControl.values, NumberControl.describe, NumberControl.kept_pictures
+    spec, budget_of, values = Control.spec, Control.budget_of, Control.values
+    describe, kept_pictures = Control.describe, Control.kept_pictures
 
     def check_choices(self) -> None:
         self.chosen = {"aspect": 1.0, "picture": None, **self.chosen}
 
-    def default(self, parameter: Parameter) -> Number:
+    def in_scene(self, parameter: Parameter) -> Parameter:
         if parameter.name != "lumens":
-            return super().default(parameter)
-        return self._bright() if self.asked and not self.searches("lumens") else 0.0
-
-    def _bright(self) -> float:
-        """Lumens of a spot of the default width that is `TIMES` as bright as the place."""
+            return super().in_scene(parameter)
         area = 2.0 * math.pi * (WIDTH / WIDTH_OF_ONE * self.scene.metres) ** 2
-        return min(LUMENS, TIMES * float(super().default(self.named("ambient"))) * area)
+        bright = min(LUMENS, TIMES * float(self.resting("ambient")) * area)  # of a spot of the default width
+        return replace(
+            parameter, search=(0.0, bright), default=bright if self.asked and not self.searches("lumens") else 0.0
+        )
 
     def unchanged(self, parameter: Parameter) -> Number:
-        return 0.0 if parameter.name == "lumens" else self.default(parameter)
-
-    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
-        return (0.0, self._bright()) if parameter.name == "lumens" else parameter.search
+        return 0.0  # of the lumens; see `amount`
 
     def thrown(self, values: Values) -> Tensor:
         half = math.tan(math.radians(self.part.fov) / 2.0) * values["distance"].detach() / self.scene.metres
@@ -86,7 +76,7 @@ class SpotControl(ProjectorControl):
         deviation = values["width"] / WIDTH_OF_ONE
         away = (across[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
         spot = torch.exp(-0.5 * away / deviation**2) * (2.0 * half) ** 2 / (2.0 * math.pi * deviation**2)
-        return spot[..., None] * srgb_to_linear(torch.stack([values[name] for name in CHANNELS]))
+        return spot[..., None] * color_of(values)
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         brightest = float(self.thrown(values).detach().max())

@@ -20,22 +20,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import (
-    LARGEST_EPSILON,
-    NOTHING,
-    Budget,
-    Choice,
-    Control,
-    Group,
-    Parameter,
-    Value,
-    change_in_colour,
-)
+from advsearch.controls.base import LARGEST_EPSILON, NOTHING, Choice, Control, Parameter, Value, changed
 from advsearch.controls.corruption_filters import resized
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Bools, Floats, Mesh
+from advsearch.scene.assets import Bools, Floats
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription
+from advsearch.scene.gradients import Budget, Group
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import rasterised, texels_of_faces
 
@@ -53,39 +44,27 @@ WAVE_REACH = 3.0
 
 
 class TextureControl(Control):
-    """The base-colour map of one mesh, inside a ball around the original."""
+    """The base-colour map of the object or another mesh, inside a ball around the original."""
 
     kind = "texture"
     of_a_mesh = True
-    summary = "The base-colour map of the object or another mesh, inside a ball around the original."
     parameters = (
-        Parameter(
-            "texels", (None, None, 3), "sRGB", 0.0, 1.0, "the object's own texture", "Display-referred texel values.",
-            search=(0.0, 1.0), estimators=("adjoint",),
-        ),
-        Parameter(
-            "palette", (None, 3), "sRGB", 0.0, 1.0, "the texture's own colours",
-            "Colours that the texture is repainted with (form palette).", search=(0.0, 1.0),
-            estimators=("adjoint", "differences"),
-        ),
-        Parameter(
-            "amplitudes", (None, None, 3), "1", -1.0, 1.0, 0.0,
-            "Strength of each wave in each colour channel (form waves).", search=(-1.0, 1.0), estimators=("adjoint",),
-        ),
+        Parameter("texels", (None, None, 3), "sRGB", 0.0, 1.0, "the object's own texture",
+                  "Display-referred texel values.", search=(0.0, 1.0), estimators=("adjoint",)),
+        Parameter("palette", (None, 3), "sRGB", 0.0, 1.0, "the texture's own colours",
+                  "Colours that the texture is repainted with (form palette).", search=(0.0, 1.0),
+                  estimators=("adjoint", "differences")),
+        Parameter("amplitudes", (None, None, 3), "1", -1.0, 1.0, 0.0,
+                  "Strength of each wave in each colour channel (form waves).", search=(-1.0, 1.0),
+                  estimators=("adjoint",)),
     )  # fmt: skip
     choices = (
-        Choice(
-            "epsilon", DEFAULT_EPSILON, "Radius of the ball around the original texture, display-referred.", "epsilon",
-            most=LARGEST_EPSILON,
-        ),
-        Choice(
-            "norm", "linf", "Norm of the ball: linf (per texel value) or l2 (Euclidean, over all texel values).",
-            "norm", options=NORMS,
-        ),
-        Choice(
-            "resolution", None, "Side of the searched texture in texels; by default the object's own, 256 to 512.",
-            "texture_resolution", whole=(2, 4096),
-        ),
+        Choice("epsilon", DEFAULT_EPSILON, "Radius of the ball around the original texture, display-referred.",
+               "epsilon", most=LARGEST_EPSILON),
+        Choice("norm", "linf", "Norm of the ball: linf (per texel value) or l2 (Euclidean, over all texel values).",
+               "norm", options=NORMS),
+        Choice("resolution", None, "Side of the searched texture in texels; by default the object's own, 256 to 512.",
+               "texture_resolution", whole=(2, 4096)),
         Choice("form", "texels", "What is searched: texels, palette (a few colours) or waves (smooth patterns)."),
         Choice("colors", 6, "Number of colours of the palette.", whole=(1, LARGEST_PALETTE)),
         Choice("waves", 8, "Number of waves along each side of the texture.", whole=(1, LARGEST_WAVES)),
@@ -132,11 +111,24 @@ class TextureControl(Control):
         longer, side = max(original.shape[:2]), self.chosen["resolution"]
         if side or names is None or longer < RESOLUTIONS[0]:
             original = resampled(original, int(side or min(max(longer, RESOLUTIONS[0]), RESOLUTIONS[1])))
-        where = None if names is None else self._texels_of(part, names, (original.shape[0], original.shape[1]))
-        self._on, self._original, self._materials = part.name, original, ", ".join(names or ())
-        self._where = None if where is None else torch.from_numpy(where)
-        self._painter = painter = self._painter_of(part.mesh, original, where)
-        self._unchanged = painter.texels(painter.start)
+        shape = original.shape[0], original.shape[1]
+        where = None if names is None else torch.from_numpy(self._texels_of(part, names, shape))
+        mask = torch.ones(shape, dtype=torch.bool) if where is None else where
+        texels, norm, epsilon = original[mask], self.chosen["norm"], self._given.get("epsilon")
+        if self.form == "palette":
+            area = np.where(mask.numpy(), rasterised(part.mesh, shape).areas(), 0.0).astype(np.float32)
+            weight = area if area.any() else mask.numpy().astype(np.float32)
+            centres = palette(original, weight, int(self.chosen["colors"]))
+            painter = recoloured(texels, centres, Budget(norm, radius(norm, epsilon, centres.numel())))
+        elif self.form == "waves":
+            flat = radius(norm, epsilon, texels.numel()) / (math.sqrt(texels.numel()) if norm == "l2" else 1.0)
+            painter = waved(texels, mask, int(self.chosen["waves"]), flat)
+        else:  # each texel value on its own
+            budget = Budget(norm, radius(norm, epsilon, texels.numel()))
+            group = Group("texels", texels.numel(), ("adjoint",), budget)
+            painter = Painter(texels.reshape(-1), group, lambda u: u.reshape(-1, 3))
+        self._on, self._original, self._materials, self._where = part.name, original, ", ".join(names or ()), where
+        self._painter, self._unchanged = painter, painter.texels(painter.start)
         self.start, self.groups = painter.start, (painter.group,)
 
     def _texels_of(self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]) -> Bools:
@@ -156,21 +148,6 @@ class TextureControl(Control):
             )
         return where
 
-    def _painter_of(self, mesh: Mesh, original: Tensor, where: Bools | None) -> Painter:
-        shape = original.shape[0], original.shape[1]
-        mask = torch.ones(shape, dtype=torch.bool) if where is None else torch.from_numpy(where)
-        texels, norm = original[mask], self.chosen["norm"]
-        epsilon = self._given.get("epsilon")
-        if self.form == "palette":
-            area = np.where(mask.numpy(), rasterised(mesh, shape).areas(), 0.0).astype(np.float32)
-            weight = area if area.any() else mask.numpy().astype(np.float32)
-            centres = palette(original, weight, int(self.chosen["colors"]))
-            return recoloured(texels, centres, ball(norm, epsilon, centres.numel()))
-        if self.form == "waves":
-            flat = radius(norm, epsilon, texels.numel()) / (math.sqrt(texels.numel()) if norm == "l2" else 1.0)
-            return waved(texels, mask, int(self.chosen["waves"]), flat)
-        return repainted(texels, ball(norm, epsilon, texels.numel()))
-
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return {f"{self._on}.base_color": srgb_to_linear(self._texels(u))}
 
@@ -184,7 +161,7 @@ class TextureControl(Control):
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         change = self._painter.texels(u.detach()) - self._unchanged.to(u.device)
         named: dict[str, Value] = {f"{self.name}.materials": {"value": self._materials, "unit": "name"}}
-        return (named if self._materials else {}) | change_in_colour(self.name, change)
+        return (named if self._materials else {}) | changed(self.name, change)
 
     def printed(self, u: Tensor) -> Tensor | None:
         texels = self._texels(u)
@@ -200,29 +177,12 @@ def radius(norm: str, epsilon: float | None, count: int) -> float:
     return DEFAULT_EPSILON * (math.sqrt(count) if norm == "l2" else 1.0) if epsilon is None else float(epsilon)
 
 
-def ball(norm: str, epsilon: float | None, count: int) -> Budget:
-    """Return that ball."""
-    return Budget(norm, radius(norm, epsilon, count))
-
-
 class Painter(NamedTuple):
-    """One form of the control: a map from its slice of u to the n texels that it paints, row by row.
+    """One form of the control: a map from its slice of u to the n texels that it paints, row by row."""
 
-    Attributes:
-        start: (d,) float32, the slice that gives the original.
-        group: the slice as a group.
-        texels: maps (d,) in [0, 1] to (n, 3) display-referred sRGB in [0, 1]; differentiable.
-    """
-
-    start: Tensor
-    group: Group
-    texels: Callable[[Tensor], Tensor]
-
-
-def repainted(original: Tensor, budget: Budget) -> Painter:
-    """Return what paints each texel value on its own."""
-    group = Group("texels", original.numel(), ("adjoint",), budget)
-    return Painter(original.reshape(-1), group, lambda u: u.reshape(-1, 3))
+    start: Tensor  # (d,) float32, the slice that gives the original
+    group: Group  # the slice as a group
+    texels: Callable[[Tensor], Tensor]  # (d,) in [0, 1] to (n, 3) display-referred sRGB in [0, 1]; differentiable
 
 
 def recoloured(original: Tensor, centres: Tensor, budget: Budget) -> Painter:

@@ -9,7 +9,7 @@ straight on overlap over one stretch of its way, so that t is exact.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Parameter, Value, measure
-from advsearch.controls.numbers import NumberControl, Slot, Values
+from advsearch.controls.base import Control, Parameter, Value, Values, measure, named
 from advsearch.controls.occlusion import camera_in
 from advsearch.controls.pose import euler
+from advsearch.controls.ranges import Slot
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Doubles
 from advsearch.scene.description import OBJECT, SceneDescription
@@ -39,35 +39,24 @@ AWAY, SUNK = 1e-5, 0.01  # size of a thing that is away, and how many metres it 
 
 
 class Stand(NamedTuple):
-    """Where a thing stands, in the coordinates of the scene.
+    """Where a thing stands, in the coordinates of the scene."""
 
-    Attributes:
-        place: (2,) of its middle.
-        height: of the ground there.
-        pushed: how far it was moved away from the object.
-    """
-
-    place: Doubles
-    height: float
-    pushed: float
+    place: Doubles  # (2,) of its middle
+    height: float  # of the ground there
+    pushed: float  # how far it was moved away from the object
 
 
-class ThingsControl(NumberControl):
+class ThingsControl(Control):
     """Where the things beside the object stand, how they are turned, and whether they are there."""
 
     kind = "things"
-    summary = "Where the things beside the object stand, how they are turned, and whether they are there."
     parameters = (
         moving(ORBIT, "x", "metres", -1000.0, 1000.0, 0.0, "Forwards from where it was put.", (-2.0, 2.0)),
         moving(ORBIT, "y", "metres", -1000.0, 1000.0, 0.0, "To the left of where it was put.", (-2.0, 2.0)),
-        moving(
-            ORBIT, "heading", "degrees", -3600.0, 3600.0, 0.0, "Turn from how it was put, counter-clockwise.",
-            (-180.0, 180.0), periodic=True,
-        ),
-        Parameter(
-            "presence", (), "name", 0.0, 1.0, "there", "Whether it is there.", moves_silhouettes=True,
-            options=("there", "away"),
-        ),
+        moving(ORBIT, "heading", "degrees", -3600.0, 3600.0, 0.0, "Turn from how it was put, counter-clockwise.",
+               (-180.0, 180.0), periodic=True),
+        named("presence", ("there", "away"), "there", "Whether it is there.", estimators=("differences",),
+              moves_silhouettes=True),
     )  # fmt: skip
 
     @classmethod
@@ -97,14 +86,13 @@ class ThingsControl(NumberControl):
                 raise InputError(f"`controls` {self.name}: {name} stands in something else; put it elsewhere")
 
     def laid_out(self) -> Iterator[Slot]:
-        for thing, parameter in product(self.scene.things, self.parameters):
-            asked, value = f"{thing}.{parameter.name}", self.default(parameter)
-            spec = self.specs[asked] if asked in self.specs else self.spec(parameter, value)
-            yield Slot(replace(parameter, name=asked), spec, 1, value)
+        for thing, parameter in product(self.scene.things, map(self.in_scene, self.parameters)):
+            asked = f"{thing}.{parameter.name}"
+            yield Slot(replace(parameter, name=asked), self.specs.get(asked, self.spec(parameter)))
 
-    def search_range(self, parameter: Parameter) -> tuple[float, float] | None:
+    def in_scene(self, parameter: Parameter) -> Parameter:
         reach = min(2.0, self.scene.metres)  # beside a small thing, two metres are off its table
-        return (-reach, reach) if parameter.name in ("x", "y") else parameter.search
+        return replace(parameter, search=(-reach, reach)) if parameter.name in ("x", "y") else parameter
 
     @property
     def refines(self) -> frozenset[str]:
@@ -145,7 +133,7 @@ class ThingsControl(NumberControl):
         around = eye[:2] + free * np.stack([np.cos(EIGHTHS), np.sin(EIGHTHS)], axis=1)
         others = [thing, Footprint(around, eye[2], eye[2] + free)]
         others += [_footprint(scene, name, so_far) for name in scene.things if name not in self._moved]
-        found = {}
+        stands = {}
         for name in self._moved:
             x, y, heading, away = (float(values[f"{name}.{one.name}"].detach()) for one in self.parameters)
             foot, base = _foot(scene.meshes[name]), _footprint(scene, name, so_far)
@@ -157,12 +145,15 @@ class ThingsControl(NumberControl):
             here = Footprint(outline + asked, base.low, base.high)
             way = asked - middle_of
             way = way / np.linalg.norm(way) if way.any() else np.array([1.0, 0.0])
-            pushed = 0.0 if away else _free(here, others, way, GAP / metres)
+            pushed = 0.0
+            for begin, end in sorted(blocked(here, other, way) for other in others if not away):
+                if begin < pushed < end:
+                    pushed = end + GAP / metres
             place = asked + pushed * way
-            found[name] = Stand(place, lift + ground_height(scene, place), pushed)
+            stands[name] = Stand(place, lift + ground_height(scene, place), pushed)
             if not away:
                 others.append(Footprint(outline + place, base.low, base.high))
-        return found
+        return stands
 
 
 def _foot(part: MeshPart) -> Doubles:
@@ -186,12 +177,3 @@ def _footprint(scene: SceneDescription, name: str, so_far: Mapping[str, Tensor])
 @lru_cache(maxsize=256)
 def _as_put(part: MeshPart) -> Footprint:
     return footprint(standing(part))
-
-
-def _free(one: Footprint, others: Sequence[Footprint], way: Doubles, gap: float) -> float:
-    """How far a thing has to be shifted along a way until it overlaps with no other."""
-    shift = 0.0
-    for begin, end in sorted(blocked(one, other, way) for other in others):
-        if begin < shift < end:
-            shift = end + gap
-    return shift

@@ -24,8 +24,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
-from email.message import Message
-from functools import partial
 from itertools import islice
 from typing import Any, Protocol, TypeAlias
 from urllib.parse import SplitResult, parse_qsl, urlsplit, urlunsplit
@@ -39,13 +37,12 @@ from advsearch.errors import InputError, ModelError, UnknownNameError
 from advsearch.files import parse_json, scaled
 from advsearch.interrupts import INTERRUPTS
 from advsearch.models.model import Model, Preprocessing
-from advsearch.models.source import Purpose, Source
+from advsearch.models.source import Purpose
 from advsearch.models.zoo.language import QUESTION, SIDE
 from advsearch.pictures import png_of
 from advsearch.registry import how_to_allow, may_fetch
 
 KEY = "ADVSEARCH_MODEL_KEY"  # the environment variable with the key that is sent as ``Authorization: Bearer``
-
 CHAT = "/chat/completions"  # how the path of an address ends that is asked as OpenAI's chat is
 
 LIMITS: dict[str, float] = {
@@ -65,7 +62,6 @@ LARGEST = 1 << 20  # bytes of an answer
 LONGEST = 1000  # characters that are kept of an answer in words
 LEAST = 1e-6  # the share of a name that an answer leaves out, or gives less: its logarithm is the logit
 REFUSED = "(refused)"  # the words of a model that declines to answer
-
 Levels: TypeAlias = npt.NDArray[np.uint8]  # A picture (H, W, 3) as a file has it
 
 
@@ -79,21 +75,43 @@ class KeepsAnswers(Protocol):
         """Keep JSON text under a key."""
 
 
-def load(spec: str) -> Source:
-    """Return the source of a model behind an address, which is finished by what it is asked for; nobody is asked yet.
-    Raises InputError: only a file names it, or as `checked`."""
+def load(spec: str, purpose: Purpose) -> Model:
+    """Return the model behind an address, which is asked for its names where nobody says them. Raises InputError: only
+    a file names it, or as `checked`; ModelError: it cannot do what it is to be asked, or nobody answers."""
     address = checked(spec)
     if not may_fetch(spec):
         raise InputError(
             f"a file names the model {spec}, to which pictures would be sent, and the key in {KEY}; "
             f"{how_to_allow(spec)}"
         )
-    finish = partial(_finished, spec, address)
-    return Source(_never, address.fragment or address.netloc, finish=finish, reads_text=True)
-
-
-def _never(pictures: Tensor) -> Any:
-    raise RuntimeError("a model behind an address is asked for something")
+    chat, name = address.path.endswith(CHAT), address.fragment or address.netloc
+    free, question = purpose.in_words(name, "is behind an address")
+    if chat and not free:
+        raise InputError(f"task: a chat such as {name} answers in words; use `task=answer`, and say the right `label`")
+    if chat and not address.fragment:
+        raise InputError(f"model {spec}: expected the name of the chat's model behind a #: {spec}#NAME")
+    asked = AskedModel(
+        url=urlunsplit(address._replace(fragment="")),
+        name=name,
+        spec=spec,
+        limits=limits_of(purpose.ask),
+        chat=address.fragment if chat else "",
+        question=question or (QUESTION if free else ""),
+        tokens=purpose.tokens,
+        times=purpose.times if free else 1,
+    )
+    if not free:
+        asked.names = purpose.names or tuple(asked.scores([np.full((SIDE, SIDE, 3), 128, np.uint8)])[0])
+        if len(asked.names) < 2:
+            raise ModelError(f"model {name}: expected scores of two names at least, got {len(asked.names)}")
+    return Model(
+        module=asked,
+        name=name,
+        labels=asked.names,
+        preprocessing=Preprocessing((SIDE, SIDE), resizes=False),
+        batch_limits=(1, 8),
+        differentiable=False,
+    )
 
 
 def checked(spec: str) -> SplitResult:
@@ -148,55 +166,122 @@ def limits_of(ask: Mapping[str, float]) -> dict[str, float]:
     return limits
 
 
-def _finished(spec: str, address: SplitResult, purpose: Purpose) -> Model:
-    chat, name = address.path.endswith(CHAT), address.fragment or address.netloc
-    purpose.check(name, "is behind an address", "classification", "answer")
-    free = purpose.is_free()
-    if chat and not free:
-        raise InputError(f"task: a chat such as {name} answers in words; use `task=answer`, and say the right `label`")
-    if chat and not address.fragment:
-        raise InputError(f"model {spec}: expected the name of the chat's model behind a #: {spec}#NAME")
-    question = purpose.one_prompt(name) or (QUESTION if free else "")
-    line = Line(urlunsplit(address._replace(fragment="")), name, limits_of(purpose.ask), spec)
-    asked = AskedModel(line, address.fragment if chat else "", question, purpose.tokens, purpose.times if free else 1)
-    if not free:
-        asked.names = purpose.names or tuple(asked.scores(np.full((SIDE, SIDE, 3), 128, np.uint8)))
-        if len(asked.names) < 2:
-            raise ModelError(f"model {name}: expected scores of two names at least, got {len(asked.names)}")
-    return Model(
-        module=asked,
-        name=name,
-        labels=asked.names,
-        preprocessing=Preprocessing((SIDE, SIDE), resizes=False),
-        batch_limits=(1, 8),
-        differentiable=False,
-    )
+class _NoRedirect(urllib.request.HTTPRedirectHandler):
+    """Follows no redirect: what is sent has a key in it."""
+
+    def redirect_request(self, *_: Any) -> None:
+        return None
 
 
-@dataclass
-class Line:
-    """Sends requests to one address, within the limits of a run; `spent` counts calls, and tokens in and out, those of
-    its earlier lives too."""
+@dataclass(eq=False)
+class AskedModel:
+    """Answers pictures (N, 3, H, W) in [0, 1], rounded to 8 bits: logits (N, names), or without names what is said of
+    each picture (`advsearch.tasks.answers.Texts`). The same picture is not sent twice in a run, also if it goes on."""
 
     url: str
     name: str
-    limits: Mapping[str, float]
-    spec: str
-    spent: Counter[str] = field(default_factory=Counter)
-    store: KeepsAnswers | None = None
+    spec: str  # what its user wrote
+    limits: Mapping[str, float]  # of a run, see `LIMITS`
+    chat: str  # the name of a chat's model; empty for the plain protocol
+    question: str  # what is asked of the picture; may be empty
+    tokens: int  # the most of an answer in words
+    times: int  # how often each picture is asked
+    names: tuple[str, ...] = ()  # of which it gives scores
+    spent: Counter[str] = field(default_factory=Counter)  # calls, and tokens in and out, of a run's earlier lives too
+    store: KeepsAnswers | None = None  # the run that keeps answers and what is spent
+    known: dict[str, dict[str, Any]] = field(default_factory=dict)  # answers, where no run keeps them
+
+    def __call__(self, pictures: Tensor) -> Any:
+        levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8).permute(0, 2, 3, 1)
+        images = list(levels.cpu().contiguous().numpy())
+        if self.names:
+            rows = self.scores(images)
+            return torch.tensor([[max(row.get(name, 0.0), LEAST) for name in self.names] for row in rows]).log()
+        answers = self._answers([(image, turn) for image in images for turn in range(self.times)])
+        shares: list[dict[str, float]] = [answer.get("scores") or {answer["text"]: 1.0} for answer in answers]
+        texts = iter([max(each, key=each.__getitem__) for each in shares])  # the likeliest name where there are scores
+        return [{"texts": list(islice(texts, self.times))} for _ in images]
+
+    def scores(self, images: Sequence[Levels]) -> list[dict[str, float]]:
+        """Return the share of each name that the answer to each picture has, in its order."""
+        rows = []
+        for answer in self._answers([(image, 0) for image in images]):
+            if "scores" not in answer:
+                raise ModelError(
+                    f"model {self.name}: answers in words ({answer['text'][:60]!r}), which are no scores; use "
+                    "`task=answer`, and say the right `label`"
+                )
+            if self.names and (other := answer["scores"].keys() - set(self.names)):
+                raise ModelError(f"model {self.name}: says {min(other)!r}, which is none of the `labels`")
+            rows.append(answer["scores"])
+        return rows
 
     def keep_in(self, store: KeepsAnswers) -> None:
-        """Keep what is spent in a run from here on, and go on counting where the run stopped."""
-        self.spent += Counter(store.noted(self._note) or {})
+        """Keep answers and what is spent in a run from here on: answers that it has are not asked for again, and
+        counting goes on where it stopped."""
+        self.spent += Counter(store.noted(f"asked {self.spec}") or {})
         self.store = store
 
-    @property
-    def _note(self) -> str:
-        return f"asked {self.spec}"
+    def _answers(self, asked: Sequence[tuple[Levels, int]]) -> list[dict[str, Any]]:
+        """The answer to each picture at each time: one that the run has, or a new one, kept as it comes. Trials differ
+        in their noise, and so in their pictures."""
+        keys, answers, new = list[str](), dict[str, Any](), dict[str, dict[str, Any]]()
+        for image, turn in asked:
+            body = self._body(image)
+            digest = hashlib.blake2b(json.dumps([body, turn, self.spec]).encode(), digest_size=16).hexdigest()
+            keys.append(key := f"answer {digest}")
+            answers[key] = self.known.get(key) if self.store is None else self.store.noted(key)
+            if not isinstance(answers[key], dict):
+                new[key] = body
+        for place, sent in self._send(list(new.values())):
+            self._count_tokens(sent)
+            key, answer = list(new)[place], self._read_chat(sent) if self.chat else self._read(sent)
+            answers[key] = answer
+            if self.store is None:
+                self.known[key] = answer
+            else:
+                self.store.set_note(key, json.dumps(answer))
+        return [answers[key] for key in keys]
 
-    def _keep(self) -> None:
+    def _body(self, image: Levels) -> dict[str, Any]:
+        picture = base64.b64encode(png_of(image)).decode()
+        if not self.chat:
+            return {"image": picture, **({"prompt": self.question} if self.question else {})}
+        content = [
+            {"type": "text", "text": self.question},
+            {"type": "image_url", "image_url": {"url": f"data:image/png;base64,{picture}"}},
+        ]
+        return {"model": self.chat, "messages": [{"role": "user", "content": content}], "max_tokens": self.tokens}
+
+    def _read(self, answer: Mapping[str, Any]) -> dict[str, Any]:
+        scores, text = answer.get("scores"), answer.get("text")
+        if isinstance(scores, dict) and scores:
+            shares = list(scores.values())
+            bad = [share for share in shares if isinstance(share, bool) or not isinstance(share, (int, float))]
+            if bad or not all(0.0 <= share <= 1.0 for share in shares):
+                raise self._wrong("scores from 0 to 1", f"{bad or [min(shares), max(shares)]}")
+            return {"scores": scores}
+        if isinstance(text, str):
+            return {"text": text[:LONGEST]}
+        raise self._wrong('{"scores": {NAME: SHARE}} or {"text": WORDS}', answer)
+
+    def _read_chat(self, answer: Mapping[str, Any]) -> dict[str, Any]:
+        try:
+            message = answer["choices"][0]["message"]
+            content, refusal = message.get("content"), message.get("refusal")
+        except (KeyError, IndexError, TypeError, AttributeError):
+            raise self._wrong("choices with a message, as a chat answers", answer) from None
+        if isinstance(content, list):
+            content = " ".join(str(part.get("text", "")) for part in content if isinstance(part, dict))
+        if not content and (refusal or answer["choices"][0].get("finish_reason") == "content_filter"):
+            return {"text": REFUSED}
+        if not isinstance(content, str):
+            raise self._wrong("an answer in words", type(content).__name__)
+        return {"text": content[:LONGEST]}
+
+    def _keep_spent(self) -> None:
         if self.store is not None:
-            self.store.set_note(self._note, json.dumps(self.spent))
+            self.store.set_note(f"asked {self.spec}", json.dumps(self.spent))
 
     @property
     def _so_far(self) -> dict[str, float]:
@@ -214,35 +299,20 @@ class Line:
         return f"The model {self.name} was asked {calls:,} times{more}."
 
     @property
-    def _over(self) -> str:
-        """Which limit is reached; nothing where another call is allowed."""
-        for name, number in self._so_far.items():
-            if number >= (limit := self.limits[name]):
-                return (
-                    f"model {self.name}: {number:,.10g} {name} are spent, and `ask` allows {limit:,.10g}; `advsearch "
-                    f"resume RUN ask.{name}={2 * limit or 1:.10g}` goes on with more, and asks nothing twice"
-                )
-        return ""
-
-    @property
     def _priced_by_token(self) -> bool:
         return bool(self.limits["per_million_in"] or self.limits["per_million_out"])
 
-    @property
-    def at_once(self) -> int:
-        """Requests that are under way at the same time: one where only its answer tells whether another is allowed."""
-        by_token = self._priced_by_token and self.limits["money"] < LIMITS["money"]
-        waits = self.limits["tokens"] < LIMITS["tokens"] or by_token
-        return 1 if waits else int(self.limits["at_once"])
-
-    def send(self, bodies: Sequence[Mapping[str, Any]]) -> Iterator[tuple[int, dict[str, Any]]]:
+    def _send(self, bodies: Sequence[Mapping[str, Any]]) -> Iterator[tuple[int, dict[str, Any]]]:
         """Yield the places of what is sent, each with the JSON object that the server answers; several are sent at
         once, and again where it is busy. Raises ModelError: limits are reached, nobody answers, or something else
         comes; what has been answered by then is yielded before."""
         left = [(place, TRIES, FIRST_WAIT) for place in range(len(bodies))]
+        by_token = self._priced_by_token and self.limits["money"] < LIMITS["money"]
+        waits = self.limits["tokens"] < LIMITS["tokens"] or by_token  # only an answer tells whether another is allowed
+        at_once = 1 if waits else int(self.limits["at_once"])
         while left:
             INTERRUPTS.look()
-            wave = [left.pop(0) for _ in range(self._reserve(min(self.at_once, len(left))))]
+            wave = [left.pop(0) for _ in range(self._reserve(min(at_once, len(left))))]
             sent = self._together([json.dumps(bodies[place]).encode() for place, _, _ in wave])
             failed, again = list[str](), list[tuple[int, int, float]]()
             for (place, tries, wait), answer in zip(wave, sent, strict=True):
@@ -263,14 +333,22 @@ class Line:
                 left = [(place, tries, 2 * wait) for place, tries, wait in again] + left
 
     def _reserve(self, most: int) -> int:
-        """Count calls before they are made, as many as the limits allow, and return how many these are."""
+        """Count calls before they are made, as many as the limits allow, and return how many these are. Raises
+        ModelError: none is allowed."""
         count = 0
-        while count < most and not (over := self._over):
+        while count < most:
+            reached = [name for name, number in self._so_far.items() if number >= self.limits[name]]
+            if reached and count:
+                break
+            if reached:
+                name, limit = reached[0], self.limits[reached[0]]
+                raise ModelError(
+                    f"model {self.name}: {self._so_far[name]:,.10g} {name} are spent, and `ask` allows {limit:,.10g}; "
+                    f"`advsearch resume RUN ask.{name}={2 * limit or 1:.10g}` goes on with more, and asks nothing twice"
+                )
             self.spent["calls"] += 1
             count += 1
-        if not count:
-            raise ModelError(over)
-        self._keep()
+        self._keep_spent()
         return count
 
     def _together(self, bodies: Sequence[bytes]) -> list[dict[str, Any] | Exception]:
@@ -291,15 +369,26 @@ class Line:
 
     def _failure(self, error: Exception, *, first: bool) -> tuple[str, bool, float]:
         """Return why nothing was answered, whether it may be later, and after how many seconds."""
-        if isinstance(error, urllib.error.HTTPError):
-            with error:
-                why = self._why(error)
-            asked_to = error.headers.get("Retry-After", "")
-            return why, error.code in BUSY, float(asked_to) if asked_to.isdigit() else 0.0
-        reason = getattr(error, "reason", error)
-        why = self._clean(f"{type(reason).__name__}: {reason}" if str(reason) else type(reason).__name__)
-        nobody_yet = first and isinstance(reason, ConnectionRefusedError)
-        return why, not nobody_yet and not isinstance(reason, (ssl.SSLCertVerificationError, ValueError)), 0.0
+        if not isinstance(error, urllib.error.HTTPError):
+            reason = getattr(error, "reason", error)
+            why = self._clean(f"{type(reason).__name__}: {reason}" if str(reason) else type(reason).__name__)
+            nobody_yet = first and isinstance(reason, ConnectionRefusedError)
+            return why, not nobody_yet and not isinstance(reason, (ssl.SSLCertVerificationError, ValueError)), 0.0
+        code, headers = error.code, error.headers
+        with error:
+            if 300 <= code < 400:
+                there = self._clean(headers.get("Location", "elsewhere"))
+                why = (
+                    f"sends on to {there}, and pictures and keys are not sent there; give that address if you trust it"
+                )
+            elif code in (401, 403):
+                why = f"status {code}: the key in {KEY} {'is not accepted' if _key() else 'is missing'}"
+            else:
+                why = f"status {code} {self._clean(str(error.reason))}: "
+                with suppress(OSError, http.client.HTTPException):
+                    why += self._clean(error.read(2000).decode(errors="replace"))[:300]
+        asked_to = headers.get("Retry-After", "")
+        return why, code in BUSY, float(asked_to) if asked_to.isdigit() else 0.0
 
     def _sent(self, body: bytes) -> dict[str, Any]:
         key = _key()
@@ -316,41 +405,30 @@ class Line:
                 parts.append(part)
                 size += len(part)
                 if size > scaled(LARGEST):
-                    raise self.wrong(f"an answer of at most {scaled(LARGEST):,} bytes", "a longer one")
+                    raise self._wrong(f"an answer of at most {scaled(LARGEST):,} bytes", "a longer one")
                 if time.monotonic() > end:
                     raise TimeoutError(f"no answer within {self.limits['seconds']:g} seconds")
         text = b"".join(parts)
         try:
             answer = parse_json(text.decode(), finite=True)
         except ValueError as error:  # UnicodeDecodeError is one
-            raise self.wrong("JSON", f"{self._clean(text[:60].decode(errors='replace'))!r} ({error})") from None
+            raise self._wrong("JSON", f"{self._clean(text[:60].decode(errors='replace'))!r} ({error})") from None
         if not isinstance(answer, dict):
-            raise self.wrong("a JSON object", type(answer).__name__)
+            raise self._wrong("a JSON object", type(answer).__name__)
         return answer
-
-    def _why(self, error: urllib.error.HTTPError) -> str:
-        if 300 <= error.code < 400:
-            there = self._clean(error.headers.get("Location", "elsewhere"))
-            return f"sends on to {there}, and pictures and keys are not sent there; give that address if you trust it"
-        if error.code in (401, 403):
-            return f"status {error.code}: the key in {KEY} {'is not accepted' if _key() else 'is missing'}"
-        body = ""
-        with suppress(OSError, http.client.HTTPException):
-            body = self._clean(error.read(2000).decode(errors="replace"))
-        return f"status {error.code} {self._clean(str(error.reason))}: {body[:300]}"
 
     def _clean(self, text: str) -> str:
         """What a server says, in one line and without the key, which it may send back."""
         text = text.replace(_key(), "(key)") if _key() else text
         return " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
 
-    def wrong(self, expected: str, got: str | Mapping[str, Any]) -> ModelError:
+    def _wrong(self, expected: str, got: str | Mapping[str, Any]) -> ModelError:
         """Return the error for an answer that is something else, or an object with other keys."""
         if isinstance(got, Mapping):
             got = self._clean(", ".join(map(str, got)) or "nothing")[:100]
         return ModelError(f"model {self.name}: expected {expected}, got {got} ({self.url})")
 
-    def count_tokens(self, answer: Mapping[str, Any]) -> None:
+    def _count_tokens(self, answer: Mapping[str, Any]) -> None:
         """Count the tokens that an answer says it took. Raises ModelError where a limit needs them and it says none."""
         usage = answer.get("usage")
         usage = usage if isinstance(usage, Mapping) else {}
@@ -358,124 +436,6 @@ class Line:
         tokens = [n for n in numbers if isinstance(n, int) and not isinstance(n, bool) and n >= 0]
         if len(tokens) == 2:
             self.spent.update(tokens_in=tokens[0], tokens_out=tokens[1])
-            self._keep()
+            self._keep_spent()
         elif self.limits["tokens"] < LIMITS["tokens"] or self._priced_by_token:
-            raise self.wrong("`usage` with prompt_tokens and completion_tokens, as `ask` counts tokens", "none")
-
-
-class _NoRedirect(urllib.request.HTTPRedirectHandler):
-    """Follows no redirect: what is sent has a key in it."""
-
-    def redirect_request(
-        self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Message, newurl: str
-    ) -> None:
-        return None
-
-
-def _text(answer: Mapping[str, Any]) -> str:
-    """What is said, the likeliest name where there are scores."""
-    scores = answer.get("scores")
-    return str(max(scores, key=scores.get) if scores else answer["text"])
-
-
-class AskedModel:
-    """Answers pictures (N, 3, H, W) in [0, 1], rounded to 8 bits: logits (N, names), or without names what is said of
-    each picture (`advsearch.tasks.answers.Texts`). The same picture is not sent twice in a run, also if it goes on.
-
-    Args:
-        line: what sends.
-        chat: the name of a chat's model; empty for the plain protocol.
-        question: what is asked of the picture; may be empty.
-        tokens: the most of an answer in words.
-        times: how often each picture is asked.
-    """
-
-    def __init__(self, line: Line, chat: str, question: str, tokens: int, times: int) -> None:
-        self.line, self.chat, self.question, self.tokens, self.times = line, chat, question, tokens, times
-        self.names: tuple[str, ...] = ()
-        self._known: dict[str, dict[str, Any]] = {}
-
-    def keep_in(self, store: KeepsAnswers) -> None:
-        """Keep answers in a run from here on; those that it has are not asked for again."""
-        self.line.keep_in(store)
-
-    def __call__(self, pictures: Tensor) -> Any:
-        levels = (pictures.clamp(0.0, 1.0).nan_to_num() * 255.0).round().to(torch.uint8).permute(0, 2, 3, 1)
-        images = list(levels.cpu().contiguous().numpy())
-        if not self.names:
-            texts = iter(map(_text, self._answers([(image, turn) for image in images for turn in range(self.times)])))
-            return [{"texts": list(islice(texts, self.times))} for _ in images]
-        rows = [self._scores(answer) for answer in self._answers([(image, 0) for image in images])]
-        return torch.tensor([[max(row.get(name, 0.0), LEAST) for name in self.names] for row in rows]).log()
-
-    def scores(self, image: Levels) -> dict[str, float]:
-        """Return the share of each name that an answer has, in its order."""
-        return self._scores(self._answers([(image, 0)])[0])
-
-    def _scores(self, answer: Mapping[str, Any]) -> dict[str, float]:
-        if "scores" not in answer:
-            raise ModelError(
-                f"model {self.line.name}: answers in words ({answer['text'][:60]!r}), which are no scores; use "
-                "`task=answer`, and say the right `label`"
-            )
-        scores: dict[str, float] = answer["scores"]
-        if self.names and (other := scores.keys() - set(self.names)):
-            raise ModelError(f"model {self.line.name}: says {min(other)!r}, which is none of the `labels`")
-        return scores
-
-    def _answers(self, asked: Sequence[tuple[Levels, int]]) -> list[dict[str, Any]]:
-        """The answer to each picture at each time: one that the run has, or a new one, kept as it comes. Trials differ
-        in their noise, and so in their pictures."""
-        store, keys, answers, new = self.line.store, list[str](), dict[str, Any](), dict[str, dict[str, Any]]()
-        for image, turn in asked:
-            body = self._body(image)
-            digest = hashlib.blake2b(json.dumps([body, turn, self.line.spec]).encode(), digest_size=16).hexdigest()
-            keys.append(key := f"answer {digest}")
-            answers[key] = self._known.get(key) if store is None else store.noted(key)
-            if not isinstance(answers[key], dict):
-                new[key] = body
-        for place, sent in self.line.send(list(new.values())):
-            self.line.count_tokens(sent)
-            key, answer = list(new)[place], self._read_chat(sent) if self.chat else self._read(sent)
-            answers[key] = answer
-            if store is None:
-                self._known[key] = answer
-            else:
-                store.set_note(key, json.dumps(answer))
-        return [answers[key] for key in keys]
-
-    def _body(self, image: Levels) -> dict[str, Any]:
-        picture = base64.b64encode(png_of(image)).decode()
-        if not self.chat:
-            return {"image": picture, **({"prompt": self.question} if self.question else {})}
-        content = [
-            {"type": "text", "text": self.question},
-            {"type": "image_url", "image_url": {"url": f"data:image/png;base64,{picture}"}},
-        ]
-        return {"model": self.chat, "messages": [{"role": "user", "content": content}], "max_tokens": self.tokens}
-
-    def _read(self, answer: Mapping[str, Any]) -> dict[str, Any]:
-        scores, text = answer.get("scores"), answer.get("text")
-        if isinstance(scores, dict) and scores:
-            shares = list(scores.values())
-            bad = [share for share in shares if isinstance(share, bool) or not isinstance(share, (int, float))]
-            if bad or not all(0.0 <= share <= 1.0 for share in shares):
-                raise self.line.wrong("scores from 0 to 1", f"{bad or [min(shares), max(shares)]}")
-            return {"scores": scores}
-        if isinstance(text, str):
-            return {"text": text[:LONGEST]}
-        raise self.line.wrong('{"scores": {NAME: SHARE}} or {"text": WORDS}', answer)
-
-    def _read_chat(self, answer: Mapping[str, Any]) -> dict[str, Any]:
-        try:
-            message = answer["choices"][0]["message"]
-            content, refusal = message.get("content"), message.get("refusal")
-        except (KeyError, IndexError, TypeError, AttributeError):
-            raise self.line.wrong("choices with a message, as a chat answers", answer) from None
-        if isinstance(content, list):
-            content = " ".join(str(part.get("text", "")) for part in content if isinstance(part, dict))
-        if not content and (refusal or answer["choices"][0].get("finish_reason") == "content_filter"):
-            return {"text": REFUSED}
-        if not isinstance(content, str):
-            raise self.line.wrong("an answer in words", type(content).__name__)
-        return {"text": content[:LONGEST]}
+            raise self._wrong("`usage` with prompt_tokens and completion_tokens, as `ask` counts tokens", "none")

@@ -26,7 +26,6 @@ LARGEST = 16 << 30  # bytes of a model file, and of what it unpacks to
 LARGEST_TEXT = 64 << 20  # bytes of a member that describes the network: JSON, source code, a pickle of names
 LARGEST_RATIO = 20  # bytes that a byte of the file may unpack to; torch itself does not compress
 SLACK = 4 << 20  # bytes that a small file may unpack to, whatever the ratio
-
 _NAME = re.compile(r"[\w.+ -]+(/[\w.+ -]+)*")
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
@@ -128,10 +127,12 @@ _ITEM_BYTES = {
 }
 
 
-def rewritten_torchscript(archive: Archive) -> io.BytesIO:
-    """Return an archive for `torch.jit.load` that holds the code, the pickles and the tensors of this one. Raises
-    FileFormatError where its code calls what a network has no use for, or its pickles state what is not there."""
-    code = {name: archive.read(name, LARGEST_CODE) for name in archive.members if _is_code(name)}
+def rewritten_torchscript(archive: Archive) -> tuple[io.BytesIO, bool]:
+    """Return an archive for `torch.jit.load` that holds the code, the pickles and the tensors of this one, and whether
+    torch runs a part of the code while it loads it. Raises FileFormatError where its code calls what a network has no
+    use for, or its pickles state what is not there."""
+    scripts = [name for name in archive.members if name.startswith("code/") and name.endswith(".py")]
+    code = {name: archive.read(name, LARGEST_CODE) for name in scripts}
     if sum(map(len, code.values())) > LARGEST_CODE:
         raise refused(archive.path, f"has more than {LARGEST_CODE:,} bytes of source code")
     for name, content in code.items():
@@ -140,32 +141,19 @@ def rewritten_torchscript(archive: Archive) -> io.BytesIO:
     for name in PICKLES:
         _check_pickle(archive, name)
     tensors = [name for name in archive.members if name.partition("/")[0] in PICKLES.values()]
+    name = "version" if "version" in archive else ".data/version"
+    version = archive.read(name, 100).decode("ascii", "replace").strip()
+    if not re.fullmatch("[0-9]{1,3}", version):
+        raise refused(archive.path, f"expected a version number in {name!r}, got {version[:20]!r}")
     buffer = io.BytesIO()
     writer = torch._C.PyTorchFileWriter(buffer)
-    writer.set_min_version(_version(archive))
+    writer.set_min_version(int(version))
     for name in (*code, *PICKLES, *tensors):
         content = code[name] if name in code else archive.read(name)
         writer.write_record(name, content, len(content))
     writer.write_end_of_file()
     buffer.seek(0)
-    return buffer
-
-
-def runs_while_loading(archive: Archive) -> bool:
-    """Whether torch runs a part of the code while it loads the archive, which has been checked."""
-    return any(b"__setstate__" in archive.read(name, LARGEST_CODE) for name in archive.members if _is_code(name))
-
-
-def _is_code(name: str) -> bool:
-    return name.startswith("code/") and name.endswith(".py")
-
-
-def _version(archive: Archive) -> int:
-    name = "version" if "version" in archive else ".data/version"
-    text = archive.read(name, 100).decode("ascii", "replace").strip()
-    if not re.fullmatch("[0-9]{1,3}", text):
-        raise refused(archive.path, f"expected a version number in {name!r}, got {text[:20]!r}")
-    return int(text)
+    return buffer, any(b"__setstate__" in content for content in code.values())
 
 
 def _code_problem(content: bytes) -> str:
@@ -246,16 +234,14 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
         signs = {sign for item in level if isinstance(item, str) for sign in item}
         if any(ord(sign) not in _WHITE and not sign.isprintable() for sign in signs):
             raise refused(archive.path, f"{name!r} has text with hidden characters")
-        level = [inner for outer in level for inner in _inside(outer) if id(inner) not in seen]
+        inside = list[Any]()
+        for outer in level:
+            if isinstance(outer, dict):
+                inside += [*outer, *outer.values()]
+            elif isinstance(outer, (list, tuple, _Inert)):
+                inside += outer.parts if isinstance(outer, _Inert) else outer
+        level = [inner for inner in inside if id(inner) not in seen]
         seen.update(map(id, level))
         if not level:
             return
     raise refused(archive.path, f"{name!r} is nested deeper than {DEPTH}")
-
-
-def _inside(value: Any) -> list[Any]:
-    if isinstance(value, dict):
-        return [*value, *value.values()]
-    if isinstance(value, _Inert):
-        return value.parts
-    return list(value) if isinstance(value, (list, tuple)) else []

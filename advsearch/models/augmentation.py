@@ -14,34 +14,22 @@ from torch import Generator, Tensor
 class Augmentation:
     """What may happen to a training image, in this order; every amount is drawn anew for every image.
 
-    Args:
-        flip: probability of a horizontal mirror image.
-        smallest_crop, largest_crop: ends of the uniform side of the square crop, as parts of the image's side; its
-            place is uniform inside the image or, where it is larger, around it; there the border goes on. 1 and 1
-            switch cropping off.
-        turn: half width of the uniform angle that the crop is turned by, in degrees.
-        brightness: half width of the uniform shift, display-referred.
-        contrast: half width of the uniform factor around 1 that scales deviations from the image's mean.
-        colour: half width of the uniform factor around 1, per channel.
-        blur: probability of a 3 x 3 binomial blur.
-        noise: upper end of the uniform standard deviation of gaussian noise, display-referred.
-        noisy: probability that noise is added at all.
-        cutout: probability that a grey square hides a part.
-        largest_cutout: upper end of the square's side, as a part of the image's.
+    The side of the square crop is uniform between two parts of the image's side (1 and 1 switch it off); its place is
+    uniform inside the image or, where it is larger, around it; there the border goes on.
     """
 
-    flip: float = 0.5
+    flip: float = 0.5  # probability of a horizontal mirror image
     smallest_crop: float = 0.8
     largest_crop: float = 1.0
-    turn: float = 0.0
-    brightness: float = 0.1
-    contrast: float = 0.25
-    colour: float = 0.08
-    blur: float = 0.15
-    noise: float = 0.04
-    noisy: float = 0.3
-    cutout: float = 0.2
-    largest_cutout: float = 0.3
+    turn: float = 0.0  # half width of the uniform angle that the crop is turned by, in degrees
+    brightness: float = 0.1  # half width of the uniform shift, display-referred
+    contrast: float = 0.25  # half width of the uniform factor around 1 that scales deviations from the image's mean
+    colour: float = 0.08  # half width of the uniform factor around 1, per channel
+    blur: float = 0.15  # probability of a 3 x 3 binomial blur
+    noise: float = 0.04  # upper end of the uniform standard deviation of gaussian noise, display-referred
+    noisy: float = 0.3  # probability that noise is added at all
+    cutout: float = 0.2  # probability that a grey square hides a part
+    largest_cutout: float = 0.3  # upper end of the square's side, as a part of the image's
 
     def __call__(self, images: Tensor, generator: Generator) -> Tensor:
         """Return changed images (N, 3, H, W), float32 in [0, 1], from images of the same kind."""

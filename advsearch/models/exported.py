@@ -66,78 +66,64 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
     """Raise ValueError unless the node is arithmetic; `power` is what may still be multiplied up by exponents."""
     if depth <= 0:
         raise ValueError("it is nested too deeply")
-    if isinstance(node, ast.Constant):
-        number = node.value
-        if not isinstance(number, (int, float)):
-            raise ValueError("text")
-        if isinstance(number, int) and abs(number) >= NUMBER:
-            raise ValueError("a number that is too large")
-    elif isinstance(node, ast.Name):
-        if not (node.id in NAMES or (is_symbol(node.id) and node.id[-1].isdigit())):
-            raise ValueError(f"the name {node.id[:40]!r}")
-    else:
-        operands, power = _operands(node, power)
-        for operand in operands:
-            _check(operand, depth - 1, power)
+    operands: list[ast.expr] = []
+    match node:
+        case ast.Constant(value=number):
+            if not isinstance(number, (int, float)):
+                raise ValueError("text")
+            if isinstance(number, int) and abs(number) >= NUMBER:
+                raise ValueError("a number that is too large")
+        case ast.Name(id=name):
+            if not (name in NAMES or (is_symbol(name) and name[-1].isdigit())):
+                raise ValueError(f"the name {name[:40]!r}")
+        case ast.Call(func=ast.Name(id="Symbol" | "Float" as name), args=arguments, keywords=words):
+            text = arguments[0].value if len(arguments) == 1 and isinstance(arguments[0], ast.Constant) else None
+            options = {word.arg: word.value.value if isinstance(word.value, ast.Constant) else None for word in words}
+            if name == "Symbol":  # Symbol('s0', positive=True, integer=True)
+                assumed = None not in options and all(isinstance(value, bool) for value in options.values())
+                if not (isinstance(text, str) and is_symbol(text) and assumed):
+                    raise ValueError("a symbol of another form")
+            elif not (isinstance(text, str) and _DECIMAL.fullmatch(text)):  # Float('0.5', precision=53)
+                raise ValueError("a number of another form")
+            elif not options.keys() <= {"precision", "prec", "dps"} or not all(
+                isinstance(value, int) and 0 < value <= 200 for value in options.values()
+            ):
+                raise ValueError("a number of another precision")
+        case ast.Call(keywords=[_, *_]):
+            raise ValueError("keywords")
+        case ast.Call(func=ast.Name(id=name), args=[base, exponent]) if name in POWERS:
+            operands, power = [base], _power_left(exponent, power)
+        case ast.Call(func=ast.Name(id=name), args=arguments) if name in FUNCTIONS and len(arguments) <= 16:
+            operands = arguments
+        case ast.Call(func=function):
+            raise ValueError(f"a call of {ast.unparse(function)[:40]!r}")
+        case ast.BinOp(left=base, op=ast.Pow(), right=exponent):
+            operands, power = [base], _power_left(exponent, power)
+        case ast.BinOp(left=left, op=operator, right=right) if isinstance(operator, _OPERATORS):
+            operands = [left, right]
+        case ast.UnaryOp(op=operator, operand=operand) if isinstance(operator, _SIGNS):
+            operands = [operand]
+        case ast.Compare(left=left, ops=ops, comparators=others) if all(isinstance(op, _COMPARISONS) for op in ops):
+            operands = [left, *others]
+        case ast.BoolOp(values=parts) | ast.Tuple(elts=parts):  # a tuple is a case of a Piecewise
+            operands = parts
+        case _:
+            raise ValueError(f"{type(node).__name__} is none")
+    for operand in operands:
+        _check(operand, depth - 1, power)
 
 
-def _operands(node: ast.expr, power: int) -> tuple[list[ast.expr], int]:
-    """Return the operands of an operator or a call, and the power that is left for them."""
-    if isinstance(node, ast.Call):
-        return _arguments(node, power)
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, _SIGNS):
-        return [node.operand], power
-    if isinstance(node, ast.BoolOp):
-        return node.values, power
-    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
-        return _powered(node.left, node.right, power)
-    if isinstance(node, ast.BinOp) and isinstance(node.op, _OPERATORS):
-        return [node.left, node.right], power
-    if isinstance(node, ast.Compare) and all(isinstance(op, _COMPARISONS) for op in node.ops):
-        return [node.left, *node.comparators], power
-    if isinstance(node, ast.Tuple):  # the cases of a Piecewise
-        return node.elts, power
-    raise ValueError(f"{type(node).__name__} is none")
-
-
-def _arguments(node: ast.Call, power: int) -> tuple[list[ast.expr], int]:
-    """Return the arguments of a call that are left to check, as `_operands` does."""
-    name = node.func.id if isinstance(node.func, ast.Name) else ""
-    first = node.args[0].value if len(node.args) == 1 and isinstance(node.args[0], ast.Constant) else None
-    keys = {word.arg for word in node.keywords}
-    values = [word.value.value if isinstance(word.value, ast.Constant) else None for word in node.keywords]
-    if name == "Symbol":  # Symbol('s0', positive=True, integer=True)
-        assumed = None not in keys and all(isinstance(value, bool) for value in values)
-        if not (isinstance(first, str) and is_symbol(first) and assumed):
-            raise ValueError("a symbol of another form")
-        return [], power
-    if name == "Float":  # Float('0.5', precision=53)
-        if not (isinstance(first, str) and _DECIMAL.fullmatch(first)):
-            raise ValueError("a number of another form")
-        digits = all(isinstance(value, int) and 0 < value <= 200 for value in values)
-        if not digits or not keys <= {"precision", "prec", "dps"}:
-            raise ValueError("a number of another precision")
-        return [], power
-    if keys:
-        raise ValueError("keywords")
-    if name in POWERS and len(node.args) == 2:
-        return _powered(node.args[0], node.args[1], power)
-    if name not in FUNCTIONS or len(node.args) > 16:
-        raise ValueError(f"a call of {ast.unparse(node.func)[:40]!r}")
-    return node.args, power
-
-
-def _powered(base: ast.expr, exponent: ast.expr, power: int) -> tuple[list[ast.expr], int]:
-    """Return the base and the power that is left for it; the exponent has to be a number."""
+def _power_left(exponent: ast.expr, power: int) -> int:
+    """Return the power that is left for what has this exponent, which has to be a number."""
     exponent = _without_sign(exponent)
     if isinstance(exponent, ast.Call) and isinstance(exponent.func, ast.Name) and exponent.func.id == "Integer":
         exponent = _without_sign(exponent.args[0]) if len(exponent.args) == 1 else exponent
     if isinstance(exponent, ast.Call) and ast.unparse(exponent) in ("Rational(1, 2)", "Rational(-1, 2)"):
-        return [base], power
+        return power
     value = exponent.value if isinstance(exponent, ast.Constant) else None
     if not isinstance(value, int) or isinstance(value, bool) or value > power:
         raise ValueError("an exponent that is not a small number")
-    return [base], power // max(value, 1)
+    return power // max(value, 1)
 
 
 def _without_sign(node: ast.expr) -> ast.expr:
@@ -177,10 +163,6 @@ _GLOBALS = re.compile(
 
 _CONTAINERS = frozenset([None, "builtins.tuple", "builtins.list", "builtins.dict", "collections.OrderedDict"])
 _FORGOTTEN: JsonObject = {"metadata": {}, "guards_code": []}
-_IDENTIFIERS = frozenset(
-    "name as_name user_input_name forward_arg_names tensor_values sym_int_values sym_float_values "
-    "sym_bool_values".split()
-)
 
 
 def rewritten(archive: Archive) -> io.BytesIO:
@@ -193,7 +175,7 @@ def rewritten(archive: Archive) -> io.BytesIO:
     if not isinstance(program, dict) or not isinstance(program.get("graph_module"), dict):
         expected = f"expected a network in {names[PROGRAM]!r}, got other JSON"
         raise refused(archive.path, f"cannot be read as torch.export ({expected})")
-    program = _checked_object(archive.path, program, "")
+    program = _checked(archive.path, program, "")
     for name in EXAMPLE:
         if name in archive:
             _check_pickle(archive, name)
@@ -217,7 +199,7 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
     table = content.get("config") if isinstance(content, dict) else None
     if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
         raise refused(archive.path, f"expected a table of tensors in {config!r}, got something else")
-    table = _checked_object(archive.path, table, "tensor_name")
+    table = _checked(archive.path, table, "tensor_name")
     copied: set[str] = set()
     for name, entry in table.items():
         record = entry.get("path_name") if isinstance(entry, dict) else None
@@ -242,18 +224,14 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
 # ---- the description of the network ----------------------------------------------------------------------------------
 
 
-def _checked(path: Path, value: JsonValue, key: str) -> JsonValue:
+def _checked(path: Path, value: JsonValue, key: str) -> Any:
     """Return a value of the description, which stands under `key`, without what is left out."""
-    if isinstance(value, dict):
-        return _checked_object(path, value, key)
     if isinstance(value, list):
         return [_checked(path, inner, key) for inner in value]
-    if wrong := _problem(value, key):
-        raise refused(path, wrong)
-    return value
-
-
-def _checked_object(path: Path, value: JsonObject, key: str) -> JsonObject:
+    if not isinstance(value, dict):
+        if wrong := _problem(value, key):
+            raise refused(path, wrong)
+        return value
     checked: JsonObject = {}
     for name, inner in value.items():
         wrong = "" if name in ("", *_FORGOTTEN) else _problem(name, key)
@@ -267,7 +245,7 @@ def _checked_object(path: Path, value: JsonObject, key: str) -> JsonObject:
 
 def _problem(value: Any, key: str) -> str:
     if isinstance(value, str):
-        return _TEXTS.get(key, _identifier_problem if key in _IDENTIFIERS else _plain_problem)(value)
+        return _TEXTS.get(key, _plain_problem)(value)
     if key == "expr_str":
         return "an expression that is no text"
     if isinstance(value, int) and abs(value) >= NUMBER:
@@ -284,8 +262,7 @@ def _identifier_problem(text: str) -> str:
     return "" if proper else f"expected a name of a value, got {text[:60]!r}"
 
 
-def _argument_problem(text: str) -> str:
-    """Text that an operator is called with, such as 'same' or 'bilinear'."""
+def _argument_problem(text: str) -> str:  # that an operator is called with, such as 'same' or 'bilinear'
     return "" if len(text) <= 1000 and text.isprintable() else "has text that is too long or not printable"
 
 
@@ -300,25 +277,23 @@ def _tree_problem(text: str) -> str:
     """What a container of inputs or outputs looks like: torch imports the types that it names."""
     try:
         version, tree = files.parse_json(text)
-        level: list[Any] = [tree]
-        while level:
-            if not all(node["type"] in _CONTAINERS and _plain_context(node["context"]) for node in level):
+        nodes: list[Any] = [tree]
+        while nodes:
+            node = nodes.pop()
+            context = "[]" if node["context"] in (None, "null") else node["context"]
+            names: Any = files.parse_json(context) if isinstance(context, str) else None  # of arguments
+            plain = isinstance(names, list) and all(isinstance(name, (str, int)) for name in names)
+            if node["type"] not in _CONTAINERS or not plain or any(_plain_problem(str(name)) for name in names):
                 return "has inputs or outputs in a container that is no tuple, list or dict"
-            level = [child for node in level for child in node["children_spec"]]
+            nodes += node["children_spec"]
     except (ValueError, TypeError, KeyError, RecursionError):
         return f"expected the structure of inputs or outputs, got {text[:60]!r}"
     return "" if version == 1 else "has inputs or outputs of another version"
 
 
-def _plain_context(context: Any) -> bool:
-    """Whether the context is nothing, or the names of a dict, which become names of arguments."""
-    if context in (None, "null"):
-        return True
-    keys = files.parse_json(context) if isinstance(context, str) else None
-    return isinstance(keys, list) and all(isinstance(key, (str, int)) and not _plain_problem(str(key)) for key in keys)
-
-
 _TEXTS: dict[str, Callable[[str], str]] = {
+    **dict.fromkeys(("name", "as_name", "user_input_name", "forward_arg_names"), _identifier_problem),
+    **dict.fromkeys(("tensor_values", "sym_int_values", "sym_float_values", "sym_bool_values"), _identifier_problem),
     "expr_str": problem,
     "target": _operator_problem,
     "as_operator": _operator_problem,

@@ -32,30 +32,18 @@ Read = Callable[[Tensor], Tensor]  # from a batch as `Model.batches` yields it, 
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """A model seen as a differentiable function from images to features. Made by `features_of`.
-
-    Args:
-        model: the network and its preprocessing.
-        read: what gets the features out of it.
-        size: F, numbers per image.
-        source: where they come from, for messages and reports, e.g. "the input of head (Linear), 192 numbers".
-        penultimate: False where they are the logits, for want of anything else.
-    """
+    """A model seen as a differentiable function from images to features. Made by `features_of`."""
 
     model: Model
     read: Read = field(repr=False)
-    size: int
-    source: str
-    penultimate: bool = True
+    size: int  # F, numbers per image
+    source: str  # for messages and reports, such as "the input of head (Linear), 192 numbers"
+    penultimate: bool = True  # False where they are the logits, for want of anything else
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Return the features (N, F), float32, of images as `Model` takes them; differentiable.
-
-        One more run of the network: the logits are not computed along.
-
-        Raises:
-            InputError: not an image, or values that are clearly not in [0, 1].
-        """
+        """Return the features (N, F), float32, of images as `Model` takes them; differentiable. One more run of the
+        network: the logits are not computed along. Raises InputError: not an image, or values that are clearly not in
+        [0, 1]."""
         images = checked_images(images)
         batches = images.split(self.model.batch_limits[1])
         features: Tensor = joined([self.read(self.model.prepared(b))[: len(b)].float() for b in batches])
@@ -96,7 +84,8 @@ Calls = Callable[[Any, Tensor, Any], list[_Call]]
 
 
 def _last(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
-    """Return how to read the last layer of a network, if it has one, and what that is."""
+    """Return how to read features (N, F) of the last layer of a network, means over all axes but the first and that of
+    channels, and what that layer is; None where there is none."""
     usable = [call for call in calls(model.module, x, None) if len(call.output) == len(x)]
     heads = [call for call in usable if call.output.shape[call.axis] == model.classes]
     if not usable:
@@ -106,7 +95,9 @@ def _last(calls: Calls, model: Model, x: Tensor) -> tuple[Read, str] | None:
         return None
 
     def read(batch: Tensor) -> Tensor:
-        return _pooled(getattr(calls(model.module, batch, last.layer)[-1], part), last.axis)
+        value: Tensor = getattr(calls(model.module, batch, last.layer)[-1], part)
+        channels_last = value.movedim(last.axis, -1)
+        return channels_last.flatten(1, -2).mean(dim=1) if value.dim() > 2 else channels_last
 
     return read, f"{part} of {last.name}"
 
@@ -148,9 +139,3 @@ def _of_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
     if isinstance(network, fx.GraphModule):
         Reader(network).run(x)
     return calls
-
-
-def _pooled(value: Tensor, axis: int) -> Tensor:
-    """Return features (N, F): the mean over all axes but the first and `axis`."""
-    channels_last = value.movedim(axis, -1)
-    return channels_last.flatten(1, -2).mean(dim=1) if value.dim() > 2 else channels_last

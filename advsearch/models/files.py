@@ -24,7 +24,7 @@ from advsearch.errors import FileFormatError, ModelError
 from advsearch.files import open_regular
 from advsearch.models import exported
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.archive import LARGEST, Archive, open_archive, refused, rewritten_torchscript, runs_while_loading
+from advsearch.models.archive import LARGEST, Archive, open_archive, refused, rewritten_torchscript
 from advsearch.models.guards import try_torchscript
 from advsearch.models.labels import names_in
 from advsearch.models.probe import foreign
@@ -40,8 +40,7 @@ EXPORT_HINT = (
     "'package.module:callable@weights.safetensors'"
 )
 
-#: The largest batch sent to a program whose batch dimension is free.
-LARGEST_BATCH = 64
+LARGEST_BATCH = 64  # that is sent to a program whose batch dimension is free
 
 
 def load_file(path: Path) -> Source:
@@ -50,7 +49,11 @@ def load_file(path: Path) -> Source:
     try:
         opened = open_regular(path, "a model file", LARGEST)
     except FileNotFoundError:
-        raise FileFormatError(f"model file {path}: no such file.{_near_files(path)}") from None
+        hint = f" The folder {path.parent} does not exist either"
+        if path.parent.is_dir():
+            near = difflib.get_close_matches(path.name, [item.name for item in path.parent.iterdir()], n=3, cutoff=0.6)
+            hint = f" Did you mean {' or '.join(repr(str(path.parent / name)) for name in near)}?" if near else ""
+        raise FileFormatError(f"model file {path}: no such file.{hint}") from None
     except OSError as error:
         raise FileFormatError(f"model file {path}: cannot be read ({error.strerror or error})") from None
     with opened as file:
@@ -63,7 +66,14 @@ def load_file(path: Path) -> Source:
             raise FileFormatError(f"model file {path}: {_not_an_archive(path, head)}")
         archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
         if _kind(archive) == "torchscript":
-            return _load_torchscript(path, archive)
+            checked, runs_while_loading = rewritten_torchscript(archive)
+            if runs_while_loading and (wrong := try_torchscript(checked)):
+                raise FileFormatError(f"model file {path}: {wrong}")
+            with warnings.catch_warnings(), _damaged(path, "TorchScript"):
+                for kind in (DeprecationWarning, FutureWarning):  # the second from torch 2.14 on
+                    warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=kind)
+                module = torch.jit.load(checked, map_location="cpu")
+            return source_of(module, path.stem)
         checked = exported.rewritten(archive)
         logger = logging.getLogger("torch.export")  # prints a traceback of what is refused with a message anyway
         with _damaged(path, "torch.export"), without_unpickling(), ExitStack() as stack:
@@ -107,24 +117,6 @@ def _not_an_archive(path: Path, head: bytes) -> str:
     return f"expected a torch.export archive (.pt2) or TorchScript, got other bytes. {EXPORT_HINT}"
 
 
-def _near_files(path: Path) -> str:
-    if not path.parent.is_dir():
-        return f" The folder {path.parent} does not exist either"
-    near = difflib.get_close_matches(path.name, [item.name for item in path.parent.iterdir()], n=3, cutoff=0.6)
-    return f" Did you mean {' or '.join(repr(str(path.parent / name)) for name in near)}?" if near else ""
-
-
-def _load_torchscript(path: Path, archive: Archive) -> Source:
-    checked = rewritten_torchscript(archive)
-    if runs_while_loading(archive) and (wrong := try_torchscript(checked)):
-        raise FileFormatError(f"model file {path}: {wrong}")
-    with warnings.catch_warnings(), _damaged(path, "TorchScript"):
-        for kind in (DeprecationWarning, FutureWarning):  # the second from torch 2.14 on
-            warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=kind)
-        module = torch.jit.load(checked, map_location="cpu")
-    return source_of(module, path.stem)
-
-
 def _with_signature(source: Source, program: torch.export.ExportedProgram) -> Source:
     """Return the source with what the program's signature tells: input size, layout, batch limits, dtype. A program may
     take (N, K, 3, H, W) or (N, K, H, W, 3), all pictures of a rig at once."""
@@ -142,7 +134,11 @@ def _with_signature(source: Source, program: torch.export.ExportedProgram) -> So
     last = picture[2] == 3 and picture[0] != 3
     height, width = picture[:2] if last else picture[1:]
     size = (height, width) if isinstance(height, int) and isinstance(width, int) else None
-    low, high = _batch_limits(program, images.shape[0])
+    batch = images.shape[0]
+    low, high = (batch, batch) if isinstance(batch, int) else (1, LARGEST_BATCH)
+    if not isinstance(batch, int) and (allowed := program.range_constraints.get(batch.node.expr)) is not None:
+        low = max(int(allowed.lower), 1)
+        high = max(low, int(min(allowed.upper, LARGEST_BATCH)))
     source = replace(source, dtype=images.dtype, input_size=size, takes_more=len(values) > 1)
     if not rig:
         return replace(source, batch_limits=(low, high), layout="NHWC" if last else "NCHW")
@@ -151,22 +147,10 @@ def _with_signature(source: Source, program: torch.export.ExportedProgram) -> So
     return replace(source, module=module, batch_limits=(low * cameras, high * cameras))
 
 
-def _batch_limits(program: torch.export.ExportedProgram, batch: int | torch.SymInt) -> tuple[int, int]:
-    if isinstance(batch, int):
-        return batch, batch
-    allowed = program.range_constraints.get(batch.node.expr)
-    if allowed is None:
-        return 1, LARGEST_BATCH
-    low = max(int(allowed.lower), 1)
-    return low, max(low, int(min(allowed.upper, LARGEST_BATCH)))
-
-
 def _damaged(path: Path, kind: str) -> AbstractContextManager[None]:
-    what = (
-        f"model file {path}: cannot be read as {kind} with torch {torch.__version__}; damaged, made by another "
-        "version, or in need of unpickling, which is never done"
-    )
-    return foreign(what, kind=FileFormatError)
+    what = f"model file {path}: cannot be read as {kind} with torch {torch.__version__}"
+    more = "damaged, made by another version, or in need of unpickling, which is never done"
+    return foreign(f"{what}; {more}", kind=FileFormatError)
 
 
 FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}

@@ -91,13 +91,8 @@ class Switches:
     @classmethod
     def now(cls) -> Switches:
         """Return them as they are."""
-        return cls(
-            torch.get_default_dtype(),
-            torch.get_default_device(),
-            torch.is_grad_enabled(),
-            torch.get_deterministic_debug_mode(),
-            torch.is_anomaly_enabled(),
-        )
+        new = torch.get_default_dtype(), torch.get_default_device()
+        return cls(*new, torch.is_grad_enabled(), torch.get_deterministic_debug_mode(), torch.is_anomaly_enabled())
 
     def turn(self) -> None:
         """Turn all of them."""
@@ -170,12 +165,8 @@ class WithState(nn.Module):
     """A policy of pictures and a state that stays as it is.
 
     A policy with a method `select_action` is called as LeRobot's are: with one mapping of the pictures, as `PICTURE`,
-    and of the state, after `reset` where it has one, since what it still holds belongs to an earlier picture. Others
-    are called with the pictures and the mapping, or with the pictures alone where the state is empty.
-
-    Args:
-        network: the policy.
-        state: numbers by name.
+    and of the state (numbers by name), after `reset` where it has one, since what it still holds belongs to an earlier
+    picture. Others are called with the pictures and the mapping, or with the pictures alone where the state is empty.
     """
 
     def __init__(self, network: Callable[..., Any], state: Mapping[str, Sequence[float]]) -> None:

@@ -15,12 +15,10 @@ from advsearch.errors import FileFormatError, InputError, resembling
 from advsearch.files import parse_json, read_text
 
 PROMPT = "a photo of a {}"  # the text that a name is put into where nothing else is said
-
 LARGEST = 16 << 20  # bytes of a label file
 LONGEST = 1000  # characters of a label name; those of ImageNet have up to 130
 LONGEST_NAMES = 1 << 20  # characters of all names that a network's metadata say
 MOST_SUGGESTIONS = 4  # labels that a message suggests for an unknown one
-
 DATA = Path(__file__).parent / "data"
 SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco90", "coco91", "voc")
 """Names of the classes of data sets that many networks are trained on, in the order of their outputs. `coco91` has the
@@ -40,15 +38,10 @@ def names_nothing(name: str) -> bool:
 
 @dataclass(frozen=True)
 class LabelSet:
-    """The classes that count as right for one object ("coffee mug" and "cup" may both be).
+    """The classes that count as right for one object ("coffee mug" and "cup" may both be)."""
 
-    Args:
-        names: the model's full label names, in the order in which they were asked for.
-        indices: the class indices, distinct, in the same order.
-    """
-
-    names: tuple[str, ...]
-    indices: tuple[int, ...]
+    names: tuple[str, ...]  # the model's full label names, in the order in which they were asked for
+    indices: tuple[int, ...]  # distinct, in the same order
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -87,10 +80,8 @@ def find_label_set(text: str | int | Sequence[str | int], labels: Sequence[str],
 
 def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
     """Return index and name of the classes whose names are like `word`, best first, and then those that mean the same.
-
     What is like a word says `resembling`; what means the same ("cup" for "mug") is a table of everyday things. The name
-    is the part of the label that matched: "frying pan" of "frying pan, frypan, skillet".
-    """
+    is the part of the label that matched: "frying pan" of "frying pan, frypan, skillet"."""
     table = {name: indices for name, indices in _name_table(labels).items() if "," not in name}
     everyday = [[_key(name) for name in names] for names in json.loads((DATA / "synonyms.json").read_text("utf-8"))]
     key = _key(word)
@@ -113,31 +104,23 @@ def _find(term: str, table: dict[str, list[int]], labels: Sequence[str], named: 
         if not 0 <= index < len(labels):
             raise InputError(f"label: expected a class index from 0 to {len(labels) - 1}, got {index}")
         return index
-    if not indices:
-        raise InputError(_unknown(term, labels, named))
-    if len(indices) > 1:
+    if len(indices) == 1:
+        return indices[0]
+    if indices:
         listed = ", ".join(f"#{index} ({labels[index]})" for index in indices)
         raise InputError(f"label {term!r} names {len(indices)} classes: {listed}. Give the index, e.g. '#{indices[0]}'")
-    return indices[0]
-
-
-def _unknown(term: str, labels: Sequence[str], named: bool) -> str:
-    message = f"the model has no label {term!r}."
+    shown = ", ".join(labels[:20]) + (", ..." if len(labels) > 20 else "")
+    hint = f"Its {len(labels)} labels: {shown}"
     if not named:
         fitting = "".join(f" or `labels={name}`" for name in sets_of(len(labels)))
-        return (
-            f"{message} Its {len(labels)} classes have no names: give a label file (`labels`){fitting}, or an index "
-            "such as '#0'"
-        )
-    if near := matching_labels(term, labels)[:MOST_SUGGESTIONS]:
-        options = [f"{name!r} (#{index})" for index, name in near]
-        return f"{message} Did you mean {' or '.join(options)}?"
-    shown = ", ".join(labels[:20]) + (", ..." if len(labels) > 20 else "")
-    return f"{message} Its {len(labels)} labels: {shown}"
+        instead = f"give a label file (`labels`){fitting}, or an index such as '#0'"
+        hint = f"Its {len(labels)} classes have no names: {instead}"
+    elif near := matching_labels(term, labels)[:MOST_SUGGESTIONS]:
+        hint = f"Did you mean {' or '.join(f'{name!r} (#{index})' for index, name in near)}?"
+    raise InputError(f"the model has no label {term!r}. {hint}")
 
 
-def _key(name: str) -> str:
-    """Return what is compared: folded case, single spaces."""
+def _key(name: str) -> str:  # what is compared
     return " ".join(name.casefold().split())
 
 
@@ -267,28 +250,22 @@ def _read_file(path: Path) -> tuple[str, ...]:
         raise FileFormatError(f"{where}: cannot be read ({error.strerror or error}){advice}") from None
     if not text.strip():
         raise FileFormatError(f"{where}: expected label names, got an empty file")
+    names: Any = [line.strip() for line in text.strip("\r\n").splitlines()]
     if path.suffix.lower() == ".json" or text.lstrip()[0] in "[{":
-        names = _from_json(where, text)
-    else:
-        names = [line.strip() for line in text.strip("\r\n").splitlines()]
-    return _checked(names, FileFormatError, where)
-
-
-def _from_json(where: str, text: str) -> list[Any]:
-    try:
-        data = parse_json(text)
-    except json.JSONDecodeError as error:
-        raise FileFormatError(f"{where}: not valid JSON (line {error.lineno}: {error.msg})") from None
-    except ValueError as error:
-        raise FileFormatError(f"{where}: expected label names, got {error}") from None
-    if isinstance(data, list):
-        return data
-    if not isinstance(data, dict):
+        try:
+            names = parse_json(text)
+        except json.JSONDecodeError as error:
+            raise FileFormatError(f"{where}: not valid JSON (line {error.lineno}: {error.msg})") from None
+        except ValueError as error:
+            raise FileFormatError(f"{where}: expected label names, got {error}") from None
+    if isinstance(names, dict):
+        indices, last = list(map(str, range(len(names)))), len(names) - 1
+        if set(names) != set(indices):
+            raise FileFormatError(f"{where}: expected the {len(names)} keys to be the indices 0 to {last}, each once")
+        names = [names[index] for index in indices]
+    if not isinstance(names, list):
         raise FileFormatError(f"{where}: expected a list of names or an object from index to name")
-    indices, last = list(map(str, range(len(data)))), len(data) - 1
-    if set(data) != set(indices):
-        raise FileFormatError(f"{where}: expected the {len(data)} keys to be the indices 0 to {last}, each once")
-    return [data[key] for key in indices]
+    return _checked(names, FileFormatError, where)
 
 
 def _checked(names: Sequence[Any], kind: type[InputError], where: str) -> tuple[str, ...]:

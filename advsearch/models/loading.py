@@ -7,7 +7,6 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from advsearch.errors import InputError, ModelError, UnknownNameError, resemblin
 from advsearch.models import address, files, reference
 from advsearch.models.guards import WithState, called_under, plainly, turned_by_code
 from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
-from advsearch.models.model import PRESETS, Model, Preprocessing, Read, Triple
+from advsearch.models.model import PRESETS, Model, Preprocessing, Read
 from advsearch.models.probe import probe
 from advsearch.models.source import Purpose, Source, load_callable, source_of, split_weights
 from advsearch.models.zoo import outputs, transformers
@@ -25,7 +24,7 @@ from advsearch.registry import Registry
 
 DEFAULT_INPUT_SIZE = (224, 224)  # where neither the model nor the caller says
 
-SOURCES: Registry[Callable[[str], Source | Model]] = Registry(
+SOURCES: Registry[Callable[..., Source | Model]] = Registry(
     "advsearch.models",
     {
         "torchvision": outputs.load_torchvision,
@@ -38,6 +37,8 @@ SOURCES: Registry[Callable[[str], Source | Model]] = Registry(
     lambda name, entry: callable(entry),
 )
 """What loads ``SOURCE:NAME``, by source."""
+
+FOR_A_PURPOSE = ("timm", "hf", "http", "https")  # those of them that are told what the network is to be asked
 
 FORMS = (
     "A model is 'reference', a file (.pt2, TorchScript or .onnx), 'torchvision:NAME', 'timm:NAME', 'hf:REPOSITORY', "
@@ -106,14 +107,12 @@ def load_model(
     if names is not None and task and task.names_from:
         raise InputError(f"labels: the names of task {task.name} are those of {task.names_from}; leave `labels` out")
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds
-    source = _find(spec)
+    wanted, lengths = task.name if task else "classification", (getattr(task, "tokens", 16), getattr(task, "times", 1))
+    source = _find(spec, Purpose(wanted, names, prompts, *lengths, ask or {}))
     switches = turned_by_code()
-    if prompts is not None and not (isinstance(source, Source) and source.reads_text):
+    reads_text = source.reads_text if isinstance(source, Source) else isinstance(source.module, address.AskedModel)
+    if prompts is not None and (source is spec or not reads_text):
         raise InputError(f"prompt: model {source.name} has classes of its own and reads no text; leave `prompt` out")
-    if isinstance(source, Source) and source.finish is not None:
-        wanted = task.name if task else "classification"
-        lengths = getattr(task, "tokens", 16), getattr(task, "times", 1)
-        source = source.finish(Purpose(wanted, names, prompts, *lengths, ask or {}))
     if isinstance(source, Source) and isinstance(source.module, nn.Module):
         called_under(source.module, switches)
     if task:
@@ -165,11 +164,12 @@ def named_code(spec: str) -> str | None:
     return split_weights(text)[0]
 
 
-def _find(spec: object) -> Source | Model:
+def _find(spec: object, purpose: Purpose) -> Source | Model:
     if isinstance(spec, Model):
         return spec
     if isinstance(spec, nn.Module):
-        return transformers.of_network(spec) or outputs.of_timm(spec) or source_of(spec, type(spec).__name__)
+        known = transformers.of_network(spec, purpose) or outputs.of_timm(spec, purpose)
+        return known or source_of(spec, type(spec).__name__)
     if isinstance(spec, os.PathLike):
         return files.load_file(Path(spec))
     if not isinstance(spec, str):
@@ -181,7 +181,7 @@ def _find(spec: object) -> Source | Model:
         return reference.load(weights=weights)
     source = text.partition(":")[0].lower()
     if ":" in text and source in SOURCES:
-        return SOURCES[source](text)
+        return SOURCES[source](text, purpose) if source in FOR_A_PURPOSE else SOURCES[source](text)
     if re.fullmatch(r"[\w.-]+\.py:[\w.]+", text):
         raise InputError(f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'")
     if named_code(text) is not None:
@@ -189,78 +189,48 @@ def _find(spec: object) -> Source | Model:
     if Path(text).suffix.lower() in files.SUFFIXES or "/" in text or os.sep in text or os.path.exists(text):
         return files.load_file(Path(text))
     forms = {"hf": "hf:REPOSITORY", "http": "http://ADDRESS", "https": "https://ADDRESS"}
-    known = ["reference", *(forms.get(source, f"{source}:NAME") for source in SOURCES)]
+    names = ["reference", *(forms.get(source, f"{source}:NAME") for source in SOURCES)]
     hint = FORMS
     if re.fullmatch(r"[\w.-]+", text) and not resembling(text, ["reference"]):  # it may be a library's
         hint = f"A library's network is written with its library: 'torchvision:{text}' or 'timm:{text}'. {FORMS}"
-    raise UnknownNameError("model", text, known, hint)
+    raise UnknownNameError("model", text, names, hint)
 
 
 def _preprocessing(source: Source, given: Mapping[str, object]) -> Preprocessing:
+    """What is done to pictures, by what a user writes (Python values, or strings from a command line), or else by the
+    source."""
     instead = [key for key in ("mean", "std", "value_range", "channels") if source.processor and key in given]
     if instead:
         raise InputError(f"{instead[0]}: model {source.name} has a processor that does all of this; leave it out")
     fields: dict[str, Any] = {key: getattr(source, key) for key in ("mean", "std", "layout", "channels", "processor")}
-    fields |= {"input_size": source.input_size or DEFAULT_INPUT_SIZE}
-    fields |= parse_normalisation(given.get("mean"), given.get("std"))
-    fields |= {key: parse(given[key]) for key, parse in READERS.items() if key in given}
-    return Preprocessing(**{key: value for key, value in fields.items() if value})
-
-
-# ---- what a user writes of preprocessing: Python values, or strings from a command line ------------------------------
-
-LAYOUTS = ("NCHW", "NHWC")
-CHANNELS = ("RGB", "BGR")
-
-
-def parse_input_size(value: Any) -> tuple[int, int]:
-    """Return (height, width) from one positive integer, two, or text such as ``"224"`` and ``"240,320"``."""
-    parts = _numbers("input_size", value, (1, 2), "one whole number or (height, width)")
-    if any(part != int(part) or part < 1 for part in parts):
-        raise InputError(f"input_size: expected whole numbers of at least 1, got {value!r}")
-    return int(parts[0]), int(parts[-1])
-
-
-def parse_value_range(value: Any) -> tuple[float, float]:
-    """Return (low, high) from two numbers or text such as ``"0,255"``."""
-    low, high = _numbers("value_range", value, (2,), "two numbers (low, high), such as (0, 255)")
-    if low >= high:
-        raise InputError(f"value_range: expected low < high, got {value!r}")
-    return low, high
-
-
-def parse_normalisation(mean: Any, std: Any) -> dict[str, Triple]:
-    """Return the fields among `mean` and `std` that were given. A preset's name (``"imagenet"``, ``"half"``,
-    ``"clip"``) in one of the two also fills the other if that one is None."""
-    fields: dict[str, Triple] = {}
-    both = {"mean": mean, "std": std}
-    for key, value in both.items():
-        if isinstance(value, str) and value.strip().lower() in PRESETS:
-            preset = zip(both, PRESETS[value.strip().lower()], strict=True)
-            fields |= {name: numbers for name, numbers in preset if name == key or both[name] is None}
+    fields["input_size"] = source.input_size or DEFAULT_INPUT_SIZE
+    if "input_size" in given:
+        sides = _numbers("input_size", given["input_size"], (1, 2), "one whole number or (height, width)")
+        if any(side != int(side) or side < 1 for side in sides):
+            raise InputError(f"input_size: expected whole numbers of at least 1, got {given['input_size']!r}")
+        fields["input_size"] = int(sides[0]), int(sides[-1])
+    for key in ("mean", "std"):
+        value = given.get(key)
+        if isinstance(value, str) and value.strip().lower() in PRESETS:  # it fills the other too, if that is not given
+            preset = zip(("mean", "std"), PRESETS[value.strip().lower()], strict=True)
+            fields |= {name: numbers for name, numbers in preset if name == key or name not in given}
         elif value is not None:
             numbers = _numbers(key, value, (1, 3), f"one number, three numbers, or one of {', '.join(PRESETS)}")
             fields[key] = (numbers[0], numbers[len(numbers) // 2], numbers[-1])
-    if any(number <= 0 for number in fields.get("std", ())):
-        raise InputError(f"std: expected numbers greater than 0, got {std!r}")
-    return fields
-
-
-def parse_choice(key: str, value: Any, choices: Sequence[str]) -> str:
-    """Return the member of `choices` that `value` names in any case."""
-    text = str(value).strip().upper()
-    if text not in choices:
-        raise InputError(f"{key}: expected one of {', '.join(choices)}, got {value!r}")
-    return text
-
-
-READERS: dict[str, Callable[[Any], Any]] = {
-    "input_size": parse_input_size,
-    "value_range": parse_value_range,
-    "layout": partial(parse_choice, "layout", choices=LAYOUTS),
-    "channels": partial(parse_choice, "channels", choices=CHANNELS),
-}
-"""What reads the fields that have a form of their own."""
+    if any(number <= 0 for number in fields["std"] or ()):
+        raise InputError(f"std: expected numbers greater than 0, got {given.get('std')!r}")
+    if "value_range" in given:
+        expected = "two numbers (low, high), such as (0, 255)"
+        low, high = _numbers("value_range", given["value_range"], (2,), expected)
+        if low >= high:
+            raise InputError(f"value_range: expected low < high, got {given['value_range']!r}")
+        fields["value_range"] = (low, high)
+    for key, choices in {"layout": ("NCHW", "NHWC"), "channels": ("RGB", "BGR")}.items():
+        if key in given:
+            fields[key] = str(given[key]).strip().upper()
+            if fields[key] not in choices:
+                raise InputError(f"{key}: expected one of {', '.join(choices)}, got {given[key]!r}")
+    return Preprocessing(**{key: value for key, value in fields.items() if value})
 
 
 def _numbers(key: str, value: Any, counts: tuple[int, ...], expected: str) -> tuple[float, ...]:

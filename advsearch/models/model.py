@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from itertools import chain
 from typing import Any, final
 
@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
-from torch.utils._pytree import tree_flatten, tree_unflatten
+from torch.utils._pytree import tree_flatten, tree_leaves, tree_map_only, tree_unflatten
 
 from advsearch.errors import InputError, ModelError
 from advsearch.interrupts import INTERRUPTS
@@ -74,12 +74,9 @@ PRESETS: dict[str, tuple[Triple, Triple]] = {
 Read = Callable[[Any, int], Any]
 """From what a network returned to so many images, to its output; ValueError says what was expected."""
 
-#: Probabilities below this count as this before the logarithm is taken (its derivative stays finite in float32).
-SMALLEST_PROBABILITY = 1e-30
-#: How far outside [0, 1] a pixel may lie (finite differences overshoot a little) before the image is refused.
-RANGE_TOLERANCE = 0.01
-#: Pictures of a rig of which all that the network has computed is kept for the gradient; of more, it computes it again.
-KEPT = 4
+SMALLEST_PROBABILITY = 1e-30  # others count as this before the logarithm is taken: its derivative is finite in float32
+RANGE_TOLERANCE = 0.01  # how far outside [0, 1] a pixel may lie: finite differences overshoot a little
+KEPT = 4  # pictures of a rig of which all is kept that the network has computed; of more, it computes it again
 
 GIVEN_BY = {
     "classification": "a row of scores is what a classifier gives",
@@ -111,23 +108,14 @@ class Preprocessing:
     4. `x -> (x - mean) / std`, in the units of `value_range` and in the order of `channels`.
     5. Layout: NCHW (contiguous), or NHWC.
 
-    Where there is a `processor`, it stands for steps 2 to 4.
-
-    Args:
-        input_size: (height, width) in pixels.
-        mean: three numbers, one per channel.
-        std: three positive numbers, one per channel.
-        value_range: (low, high) that black and white are sent to.
-        layout: ``"NCHW"`` or ``"NHWC"``.
-        channels: ``"RGB"`` or ``"BGR"``.
-        processor: from pictures (N, 3, H, W) in [0, 1], RGB, to what the network takes, of the same shape.
-        resizes: whether there is the first step; a model that takes any size is given pictures as they are rendered.
+    A `processor` stands for steps 2 to 4: from pictures (N, 3, H, W) in [0, 1], RGB, to what the network takes, of the
+    same shape. Without `resizes` there is no first step: such a model is given pictures as they are rendered.
     """
 
-    input_size: tuple[int, int]
+    input_size: tuple[int, int]  # (height, width) in pixels
     mean: Triple = (0.0, 0.0, 0.0)
     std: Triple = (1.0, 1.0, 1.0)
-    value_range: tuple[float, float] = (0.0, 1.0)
+    value_range: tuple[float, float] = (0.0, 1.0)  # (low, high) that black and white are sent to
     layout: str = "NCHW"
     channels: str = "RGB"
     processor: Callable[[Tensor], Tensor] | None = None
@@ -141,18 +129,13 @@ class Preprocessing:
         if self.processor:
             x = self.processor(x.clone())  # which may write into it
         else:
-            gain, offset = self._affine
+            low, high = self.value_range  # steps 2 and 4 are a factor and a summand
+            gain = [(high - low) / std for std in self.std]
+            offset = [(low - mean) / std for mean, std in zip(self.mean, self.std, strict=True)]
             x = x.flip(1) if self.channels == "BGR" else x
             if gain != [1.0] * 3 or offset != [0.0] * 3:
                 x = torch.addcmul(x.new_tensor(offset).view(3, 1, 1), x, x.new_tensor(gain).view(3, 1, 1))
         return x.contiguous() if self.layout == "NCHW" else x.permute(0, 2, 3, 1).contiguous()
-
-    @cached_property
-    def _affine(self) -> tuple[list[float], list[float]]:
-        """Steps 2 and 4 as a factor and a summand per channel, in the network's channel order."""
-        low, high = self.value_range
-        gain = [(high - low) / std for std in self.std]
-        return gain, [(low - mean) / std for mean, std in zip(self.mean, self.std, strict=True)]
 
 
 @final
@@ -237,7 +220,7 @@ class Model:
             return moved.clone() if moved is output and not output.requires_grad else moved
 
         def asked(part: Tensor) -> Any:
-            return each_tensor(self.ask(self.prepared(part))[: len(part)], kept)
+            return tree_map_only(Tensor, kept, self.ask(self.prepared(part))[: len(part)])
 
         parts = [recomputed(asked, part) if again else asked(part) for part in images.split(most)]
         output = parts[0] if len(parts) == 1 else joined(parts)
@@ -282,11 +265,7 @@ class Detaching(TorchFunctionMode):
     evaluation too: that makes training stable (Zhu et al. 2020, arXiv 2010.04159, appendix A.4), and hides from a
     search how the picture moves them.
 
-    Args:
-        ignored: whether `detach` does nothing.
-
-    Attributes:
-        seen: whether something with a gradient was to be detached.
+    `detach` does nothing where it is `ignored`; `seen` says whether something with a gradient was to be detached.
     """
 
     def __init__(self, *, ignored: bool = False) -> None:
@@ -346,23 +325,9 @@ def joined(parts: Sequence[Any]) -> Any:
     return torch.cat(list(parts)) if isinstance(parts[0], Tensor) else list(chain.from_iterable(parts))
 
 
-def each_tensor(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
-    """Return an output with a function of every tensor in it in that one's place."""
-    if isinstance(output, Tensor):
-        return function(output)
-    if isinstance(output, Mapping):
-        return {name: each_tensor(part, function) for name, part in output.items()}
-    if isinstance(output, (list, tuple)):
-        return [each_tensor(part, function) for part in output]
-    return output
-
-
 def tensors_in(output: Any) -> list[Tensor]:
     """Return the tensors in an output, in their order."""
-    if isinstance(output, Tensor):
-        return [output]
-    parts = output.values() if isinstance(output, Mapping) else output if isinstance(output, (list, tuple)) else ()
-    return [tensor for part in parts for tensor in tensors_in(part)]
+    return [part for part in tree_leaves(output) if isinstance(part, Tensor)]
 
 
 def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor:
@@ -402,6 +367,14 @@ def mend_batch_norms(output: Any) -> None:
     Of a single picture torch 2.13 reads a gradient that comes from ``flatten(2).transpose(1, 2)``, as
     in networks whose convolutions end in a transformer, in a wrong order on the CPU, without a word. Batches are right.
     """
+
+    def laid_out(strides: tuple[int, ...], gradients: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
+        first, *others = gradients
+        if first is None or first.stride() == strides:
+            return gradients
+        laid = torch.empty_strided(first.shape, strides, dtype=first.dtype, device=first.device)
+        return laid.copy_(first), *others
+
     waiting: list[Any] = [tensor.grad_fn for tensor in tensors_in(output)]
     seen = {None}
     while waiting:
@@ -411,15 +384,7 @@ def mend_batch_norms(output: Any) -> None:
         seen.add(node)
         waiting.extend(before for before, _ in node.next_functions)
         if node.name().startswith("NativeBatchNorm"):
-            node.register_prehook(partial(_laid_out, torch.empty_like(node._saved_input, device="meta").stride()))
-
-
-def _laid_out(strides: tuple[int, ...], gradients: tuple[Tensor | None, ...]) -> tuple[Tensor | None, ...]:
-    first, *others = gradients
-    if first is None or first.stride() == strides:
-        return gradients
-    laid = torch.empty_strided(first.shape, strides, dtype=first.dtype, device=first.device)
-    return laid.copy_(first), *others
+            node.register_prehook(partial(laid_out, torch.empty_like(node._saved_input, device="meta").stride()))
 
 
 def _tensor_in(output: Any) -> Tensor | None:

@@ -46,15 +46,11 @@ LARGEST = 1 << 26  # pixels of all the images that a network takes at once, at l
 
 
 def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> Model:
-    """Return the model with `labels`, `probabilities`, `differentiable` and `batch_limits` set from what it does.
+    """Return the model with `labels`, `probabilities`, `differentiable` and `batch_limits` set from what it does. There
+    are labels for each class, or None for placeholders ("class 0"); where they came from is for messages.
 
     It is shown a grey image and one of uniform noise. The idea of looking for probabilities, randomness and missing
     gradients before an attack is AutoAttack's (Croce and Hein 2020, the flags of its reference implementation).
-
-    Args:
-        model: a model whose `labels` are not yet known; they are ignored.
-        labels: one name per class, or None for placeholders ("class 0").
-        labels_source: where the labels came from, for the message when their number is wrong.
 
     Raises:
         ModelError: it takes more than `LARGEST`, cannot be run on such an image, returns something other than logits,
@@ -94,7 +90,10 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
             f"model {model.name} returns {kind}. Their logarithm is used, so that margins are log-odds, "
             "but gradients vanish where a probability rounds to 0 or 1: remove the final softmax if you can"
         )
-    if not logits and _pixel_probabilities(model, noise):
+    with torch.no_grad():
+        output: Any = None if logits else _read(model, noise)
+    maps = isinstance(output, Tensor) and output.ndim == 4 and output.shape[1] > 1  # (N, classes, h, w)
+    if maps and _probabilities(output.movedim(1, -1).flatten(0, 2)):
         warn(
             f"model {model.name} returns probabilities for each pixel: margins are differences of these and no "
             "log-odds, and gradients vanish where one rounds to 0 or 1: remove the final softmax if you can"
@@ -118,10 +117,15 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
 
 def _run(model: Model, images: Tensor) -> Tensor:
     """Return the raw output of the network for images (N, H, W, 3) as (N, classes) float32 on the CPU. An output of
-    another kind comes as three numbers of each image, (N, 3); see `_numbers`."""
+    another kind comes as three numbers of each image, (N, 3): how many it has, their sum, and the sum of their
+    sizes."""
     if model.read is None:
         return logits_of(*_returned(model, images), None, model.name)[: len(images)].cpu()
-    return torch.stack([_numbers(output) for output in _read(model, images)]).cpu()
+    rows = []
+    for output in _read(model, images):
+        values = torch.cat([torch.zeros(0), *(tensor.float().flatten().cpu() for tensor in tensors_in(output))])
+        rows.append(torch.stack([torch.tensor(float(len(values))), values.sum(), values.abs().sum()]))
+    return torch.stack(rows)
 
 
 def _read(model: Model, images: Tensor) -> Any:
@@ -137,13 +141,6 @@ def _returned(model: Model, images: Tensor) -> tuple[Any, int]:
         return _guarded(model, lambda: model.ask(x, raw=True)), len(x)
 
 
-def _numbers(output: Any) -> Tensor:
-    """Return three numbers (3,) of the output for one image: how many it has, their sum, and the sum of their sizes."""
-    parts = [tensor.float().flatten() for tensor in tensors_in(output)]
-    values = torch.cat(parts) if parts else torch.zeros(0)
-    return torch.stack([torch.tensor(float(len(values))).to(values), values.sum(), values.abs().sum()])
-
-
 def _guarded(model: Model, call: Callable[[], Any]) -> Any:
     """Return what the foreign network returns; whatever it raises becomes a ModelError with advice. A program has to
     end, for nothing ends it; code of one's own that does not is ended by Ctrl-C."""
@@ -157,19 +154,15 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
         raise ModelError(f"model {model.name}: {error}") from None
     except Exception as error:  # any network may raise anything
         (height, width), preprocessing = model.input_size, model.preprocessing
+        made_for, why = "", _unlike_pictures(network, str(error))
         if isinstance(model.module, WithState) and model.module.state:
             sizes = ", ".join(f"{name} (N, {len(numbers)})" for name, numbers in model.module.state.items())
-            raise ModelError(
-                f"model {model.name}: cannot be called with pictures and a state of {sizes[:200]} "
-                f"({first_line(error)}). Give the `state` that it was made for"
-            ) from error
-        if why := _unlike_pictures(network, str(error)):
-            raise ModelError(f"model {model.name}: {why} ({first_line(error)})") from error
-        raise ModelError(
-            f"model {model.name}: cannot be run on a {preprocessing.channels} image of {height} x {width} pixels in "
-            f"layout {preprocessing.layout} ({first_line(error)}). Give the `input_size` and "
-            "`layout` that it was made for"
-        ) from error
+            made_for, why = "`state`", f"cannot be called with pictures and a state of {sizes[:200]}"
+        elif not why:
+            picture = f"{preprocessing.channels} image of {height} x {width} pixels in layout {preprocessing.layout}"
+            made_for, why = "`input_size` and `layout`", f"cannot be run on a {picture}"
+        advice = f". Give the {made_for} that it was made for" if made_for else ""
+        raise ModelError(f"model {model.name}: {why} ({first_line(error)}){advice}") from error
 
 
 TRUTHS = {"target", "targets", "label", "labels", "annotations", "ground_truth"}
@@ -223,15 +216,6 @@ def _odd_scores(model: Model, rows: Tensor) -> str:
     return ""
 
 
-def _pixel_probabilities(model: Model, images: Tensor) -> bool:
-    """Whether what is read in the network's output is (N, classes, h, w) of probabilities, two classes at least."""
-    with torch.no_grad():
-        output = _read(model, images)
-    if not isinstance(output, Tensor) or output.ndim != 4 or output.shape[1] < 2:
-        return False
-    return _probabilities(output.movedim(1, -1).reshape(-1, output.shape[1]))
-
-
 def _same(model: Model, a: Tensor, b: Tensor) -> bool:
     tolerance = max(REPEAT_TOLERANCE, ROUNDING * torch.finfo(model.dtype).eps)
     return bool((a - b).abs().amax() <= tolerance * a.abs().amax().clamp_min(1e-6))
@@ -267,8 +251,14 @@ def _with_gradient(model: Model, images: Tensor, repeatable: bool) -> Model:
             whole = dataclasses.replace(model, attached=True)
             with suppress(RuntimeError, ModelError):  # it may detach what must have no gradient, such as for numpy
                 slope = _slope(whole, images)[1]
-                if _is_better(model, images, slope, gradient):
-                    model, gradient = whole, slope
+                # Whether outputs change as this gradient says, and less so as the network's own does. Networks that
+                # round behind a `detach` keep their own: the other one is zero.
+                for size in (STEP, STEP / 8.0):
+                    step = max(size, ROUNDING * torch.finfo(model.dtype).eps) * (slope - gradient).sign()
+                    seen, (told, less), *_ = _moved(model, images, step, slope, gradient)
+                    if abs(seen - told) < min(abs(seen - less), AGREES * abs(told)):
+                        model, gradient = whole, slope
+                        break
         reaches, why = bool((gradient != 0).any()), "it is zero everywhere"
         if reaches and repeatable:
             _check_gradient(model, images, gradient, detaching.seen and not model.attached)
@@ -304,18 +294,6 @@ def _moved(
     outputs = [_run(model, end) for end in ends]
     foretold = [float(((ends[0] - ends[1]) * slope).sum()) for slope in slopes]
     return float(_told(outputs[0] - outputs[1])), foretold, ends, float(outputs[0].abs().sum())
-
-
-def _is_better(model: Model, images: Tensor, whole: Tensor, own: Tensor) -> bool:
-    """Return whether outputs change as a gradient without `detach` says, and less so as the network's own does. Changes
-    are taken along the signs of the difference of the two. Networks that round behind a `detach` keep their own: the
-    other one is zero."""
-    for size in (STEP, STEP / 8.0):
-        step = max(size, ROUNDING * torch.finfo(model.dtype).eps) * (whole - own).sign()
-        seen, (told, less), *_ = _moved(model, images, step, whole, own)
-        if abs(seen - told) < min(abs(seen - less), AGREES * abs(told)):
-            return True
-    return False
 
 
 def _check_gradient(model: Model, images: Tensor, gradient: Tensor, detached: bool) -> None:

@@ -34,12 +34,8 @@ REMEDY = "run `make reference` to train it, or install a release, which contains
 
 
 class ReferenceNet(nn.Module):
-    """A residual network: stem of stride 2, four stages of strides 4 to 32, average pooling, dropout, a linear layer.
-
-    Args:
-        classes: number of classes, at least 2.
-        dropout: probability that a pooled feature is dropped in training.
-    """
+    """A residual network for at least 2 classes: stem of stride 2, four stages of strides 4 to 32, average pooling,
+    dropout of pooled features in training, a linear layer."""
 
     def __init__(self, classes: int, *, dropout: float = 0.1) -> None:
         super().__init__()
@@ -121,16 +117,9 @@ def data_folder() -> Path:
 
 
 def load(folder: Path | None = None, weights: Path | None = None) -> Model:
-    """Return the model "reference" with its labels.
-
-    Args:
-        folder: where the two files are; default the package's own.
-        weights: a safetensors file of other weights of the network; default those of the folder.
-
-    Raises:
-        ModelError: they are missing, damaged, or do not fit this version's network.
-        FileFormatError: `weights` is missing or is not safetensors.
-    """
+    """Return the model "reference" with its labels, from the folder with its two files (by default the package's own),
+    or with other weights from a safetensors file. Raises ModelError: they are missing, damaged, or do not fit this
+    version's network; FileFormatError: `weights` is missing or is not safetensors."""
     net, labels = network(folder, weights)
     name = "reference" if weights is None else f"reference@{weights}"
     bare = Model(frozen(folded(net), name), name, (), Preprocessing(INPUT_SIZE))
@@ -198,18 +187,9 @@ class Trainable:
 
 
 def trainable(model: Model, layers: str = "all", *, logits: bool = True) -> Trainable:
-    """Return a copy of a model's network to train further.
-
-    It stays in evaluation mode: statistics of batches stay what they were learned as, and nothing is dropped.
-
-    Args:
-        model: of `load_model`.
-        layers: "all", or "last" for the last layer that has parameters.
-        logits: whether it has to return logits.
-
-    Raises:
-        ModelError: as `copied_network`, or the network returns something other than logits.
-    """
+    """Return a copy of a model's network to train further: all `layers`, or the "last" one that has parameters. Raises
+    ModelError: as `copied_network`, or the network returns something other than `logits`, where it has to. It stays in
+    evaluation mode: statistics of batches stay what they were learned as, and nothing is dropped."""
     if logits and (model.probabilities or model.read is not None):
         raise ModelError(f"model {model.name}: only a classifier that returns logits can be hardened")
     net = copied_network(model)

@@ -52,17 +52,17 @@ class Purpose:
             instead = " or ".join(f"`task={task}`" for task in tasks)
             raise ModelError(f"model {model} {what} and cannot do task {self.task}; use {instead}")
 
-    def is_free(self) -> bool:
-        """Whether it is a free answer. Raises InputError where names are given, of which that has none."""
-        if self.task == "answer" and self.names is not None:
+    def in_words(self, model: str, what: str) -> tuple[bool, str | None]:
+        """Return whether a network that says words answers freely, and the question that its user asks, None for a
+        default. Raises ModelError as `check`, and InputError where there are several questions, or names for a free
+        answer."""
+        self.check(model, what, "classification", "answer")
+        free, prompts = self.task == "answer", self.prompts or ()
+        if free and self.names is not None:
             raise InputError("labels: task answer has no classes; leave them out, and say the right words with `label`")
-        return self.task == "answer"
-
-    def one_prompt(self, model: str) -> str | None:
-        """Return the question that its user asks, None for a default. Raises InputError where there are several."""
-        if len(self.prompts or ()) > 1:
-            raise InputError(f"prompt: expected one question for model {model}, got {len(self.prompts or ())}")
-        return self.prompts[0] if self.prompts else None
+        if len(prompts) > 1:
+            raise InputError(f"prompt: expected one question for model {model}, got {len(prompts)}")
+        return free, prompts[0] if prompts else None
 
     def named(self, model: str, what: str, task: str) -> tuple[str, ...]:
         """Return the names, for a network that does a task and has no classes of its own. Raises ModelError as `check`,
@@ -78,23 +78,10 @@ class Purpose:
 
 @dataclass(frozen=True)
 class Source:
-    """A frozen network and its own defaults, which the caller's options override.
+    """A frozen network and its own defaults, which the caller's options override. They are as in `load_model`, and None
+    where the source does not say."""
 
-    Args:
-        module: the network, in evaluation mode, its parameters without gradients.
-        name: what to call it.
-        input_size, mean, std, layout, channels, labels: as in `load_model`; None where the source does not say.
-        processor: as in `Preprocessing`; None where `mean`, `std` and `channels` say it all.
-        batch_limits: (fewest, most) images at once.
-        dtype: floating type of the input.
-        device: where its weights are.
-        finish: of a network that is built for what it is asked: makes its source, or the model. None where the network
-            is ready.
-        reads_text: whether it is given texts beside the picture.
-        takes_more: whether it is called with more than pictures.
-    """
-
-    module: Callable[[torch.Tensor], Any]
+    module: Callable[[torch.Tensor], Any]  # in evaluation mode, its parameters without gradients
     name: str
     input_size: tuple[int, int] | None = None
     mean: Triple | None = None
@@ -102,13 +89,12 @@ class Source:
     layout: str | None = None
     channels: str | None = None
     labels: tuple[str, ...] | None = None
-    processor: Callable[[torch.Tensor], torch.Tensor] | None = None
-    batch_limits: tuple[int, int] = (1, 64)
-    dtype: torch.dtype = torch.float32
+    processor: Callable[[torch.Tensor], torch.Tensor] | None = None  # as in `Preprocessing`
+    batch_limits: tuple[int, int] = (1, 64)  # (fewest, most) images at once
+    dtype: torch.dtype = torch.float32  # of the input
     device: torch.device = CPU
-    finish: Callable[[Purpose], Source | Model] | None = None
-    reads_text: bool = False
-    takes_more: bool = False
+    reads_text: bool = False  # it is given texts beside the picture
+    takes_more: bool = False  # it is called with more than pictures
 
 
 def source_of(module: nn.Module, name: str, **fields: Any) -> Source:

@@ -124,8 +124,7 @@ class ShownResult:
 
 
 def shown(result: Result) -> ShownResult:
-    room = registry.room(result.command)
-    made: ShownResult = room.shown(result) if room and room.shown else fields_shown(result)
+    made: ShownResult = (registry.part_of(result.command, "shown") or fields_shown)(result)
     return made
 
 

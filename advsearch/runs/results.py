@@ -500,10 +500,7 @@ class SharedWork(Fields):
 
 def kind_of(values: JsonObject) -> type[Result] | None:
     """Return the result that the values of a `summary.json` are of; None if there is none of that command."""
-    room = registry.room(str(values.get("command")))
-    if room is None:
-        return None
-    kind: type[Result] | None = next(
-        (kind for name, kind in (room.others or {}).items() if name in values), room.result
-    )
-    return kind
+    command = str(values.get("command"))
+    others = registry.part_of(command, "others") or {}
+    main: type[Result] | None = registry.part_of(command, "result")
+    return next((kind for name, kind in others.items() if name in values), main)

@@ -12,25 +12,25 @@ classifier's see `gradients.SEARCH_STEP`. The renders of a difference share thei
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Mesh
+from advsearch.scene.assets import Mesh, Shape
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import camera_to_world, driving, projected, seated
 from advsearch.scene.gradients import Group
-from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass
+from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart
 
-ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})
-"""Inputs that Mitsuba never sees: the renderer applies them to radiance."""
+ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})  # inputs that the renderer applies to radiance
 
 
 class MovingMesh:
-    """One mesh, in its own coordinates, whose vertices and normals follow a pose, (4, 4) `to_world` at first, and a
-    displacement."""
+    """One mesh, in its own coordinates, whose vertices and normals follow a pose (4, 4) and a displacement."""
 
     def __init__(self, mesh: Mesh, to_world: np.ndarray) -> None:
         self._mesh = mesh
@@ -72,19 +72,31 @@ class MovingMesh:
         return torch.from_numpy(self._mesh.faces.astype(np.int64)), torch.from_numpy(groups.astype(np.int64))
 
 
+def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
+    """Return a mesh of a scene as its inputs, those of `MitsubaScene` that differ from the base values, have it: in
+    world space, z up."""
+    begin = f"{part.name}."
+    own = {key.removeprefix(begin): value.detach().cpu() for key, value in inputs.items() if key.startswith(begin)}
+    places = dict(zip(("vertices", "normals"), MovingMesh(part.mesh, part.to_world).place(None, None), strict=True))
+    rows = {name: own.get(name, flat).reshape(-1, 3).to(torch.float32).numpy() for name, flat in places.items()}
+    mesh, color = replace(part.mesh, vertices=rows["vertices"], normals=rows["normals"]), part.base_color
+    if "base_color" in own:
+        color = linear_to_srgb(own["base_color"].clamp(0.0, 1.0)).numpy()
+    material = replace(part.material, **{key: float(own[key]) for key in vars(part.material) if key in own})
+    return replace(part, mesh=mesh, base_color=color, material=material, to_world=np.eye(4))
+
+
 AWAY = 1000.0  # object sizes to the side, where a thing is under a pixel wide
 
 
 class Assembly:
-    """Turns the inputs of a space into those of `MitsubaScene`, for a scene with all its parts.
+    """Turns the inputs of a space into those of `MitsubaScene`, for a scene with all its parts."""
 
-    Attributes:
-        away: whether the object is put so far away that neither it nor its shadow is in the picture. A scene in which
-            it was so has bounds from then on that change last bits of every picture: it is for such pictures alone.
-    """
+    # whether the object is put so far away that neither it nor its shadow is in the picture. A scene in which it was so
+    # has bounds from then on that change last bits of every picture: it is for such pictures alone
+    away = False
 
     def __init__(self, description: SceneDescription) -> None:
-        self.away = False
         self.meshes = {name: MovingMesh(part.mesh, part.to_world) for name, part in description.meshes.items()}
         self._carried = [part for part in description.parts if isinstance(part, (BeamLamp, LampGlass))]
         self._photograph = description.photograph
@@ -97,13 +109,14 @@ class Assembly:
             inputs = {**inputs, f"{OBJECT}.to_world": pose}
         parameters = dict(inputs)
         for part in self._carried:  # what carries it may be moved or deformed
-            pose, offsets = (inputs.get(f"{part.carrier}.{what}") for what in ("to_world", "offsets"))
+            carrier, offsets = (inputs.get(f"{part.carrier}.{what}") for what in ("to_world", "offsets"))
             if isinstance(part, LampGlass) and offsets is not None:
                 parameters[f"{part.name}.offsets"] = offsets[torch.from_numpy(part.follows).to(offsets.device)]
-            if pose is not None and isinstance(part, BeamLamp):
-                pose = seated(driving(pose) if part.carrier == CAMERA else pose, torch.from_numpy(part.seat).to(pose))
-            if pose is not None:
-                parameters[f"{part.name}.to_world"] = pose
+            if carrier is not None and isinstance(part, BeamLamp):
+                car = driving(carrier) if part.carrier == CAMERA else carrier
+                carrier = seated(car, torch.from_numpy(part.seat).to(carrier))
+            if carrier is not None:
+                parameters[f"{part.name}.to_world"] = carrier
         for name, mesh in self.meshes.items():
             to_world, offsets = parameters.pop(f"{name}.to_world", None), parameters.pop(f"{name}.offsets", None)
             if to_world is not None or offsets is not None:

@@ -6,7 +6,7 @@ This module imports numpy only, so that the families of bundled objects and the 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -110,8 +110,7 @@ class UpAxis:
 @dataclass(frozen=True, eq=False)
 class Shape:
     """A mesh and what it looks like. Pictures have row 0 on top, at v = 1. Opacity and normal map are of the principled
-    surface; a normal map is `(n + 1) / 2` of unit normals in the frame of tangent (along u), normal x tangent and
-    normal."""
+    surface; a normal map is `(n + 1) / 2` of unit normals along tangent (along u), normal x tangent and normal."""
 
     name: str  # short, used in paths
     mesh: Mesh
@@ -169,9 +168,15 @@ class EnvironmentAsset:
 
 
 def face_vectors(corners: Doubles) -> Doubles:
-    """Return vectors (F, 3) along the sides from which triangles (F, 3, 3) are wound counter-clockwise, twice as
-    long as their areas."""
+    """Return vectors (F, 3), twice as long as their areas, out of triangles (F, 3, 3), counter-clockwise."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def pose_of(linear: npt.ArrayLike, place: npt.ArrayLike) -> Doubles:
+    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place (3,)."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = linear, place
+    return pose
 
 
 def footing(points: Doubles) -> tuple[Doubles, float]:
@@ -195,35 +200,15 @@ def normalised(mesh: Mesh) -> Mesh:
     return replace(mesh, vertices=((vertices - origin) / size).astype(np.float32))
 
 
-GRIDS = (384, 256, 192, 128, 96, 64, 48, 32, 24, 16, 12, 8)
-"""Cells of the grid along the mesh's largest extent, tried one after the other."""
-TEXTURE_CELLS = 32
-"""Cells of the texture along each side: vertices of one place that lie in different ones stay apart, as at seams."""
+GRIDS = (384, 256, 192, 128, 96, 64, 48, 32, 24, 16, 12, 8)  # cells along the mesh's largest extent, tried in turn
+TEXTURE_CELLS = 32  # of the texture along each side: vertices of one place in different ones stay apart, as at seams
 
 
-@dataclass(frozen=True, eq=False)
-class Simpler:
-    """Which vertices and faces of a mesh are left."""
-
-    kept: Ints  # (W,) number of the vertex that each one left has its normal and texture coordinates from
-    place: Ints  # (W,) number of the place that each one left stands at
-    places: Ints  # (V,) number of the place that each vertex of the mesh goes to
-    faces: npt.NDArray[np.uint32]  # (G, 3) indices of those left
-
-    def of(self, mesh: Mesh) -> Mesh:
-        """Return what is left of the mesh, or of one that only stands elsewhere. Each vertex stands at the mean of
-        those that came together there."""
-        counts = np.bincount(self.places)
-        mean = np.stack([np.bincount(self.places, mesh.vertices[:, axis]) / counts for axis in range(3)], axis=1)
-        places: Floats = mean[self.place].astype(np.float32)
-        return Mesh(places, self.faces, mesh.normals[self.kept], mesh.uvs[self.kept])
-
-
-def simpler(mesh: Mesh, most: int) -> Simpler | None:
-    """Return how a mesh is shown with at most `most` faces, or the fewest of a coarse grid; None: it has no more. After
-    Rossignac and Borrel (1993, "Multi-resolution 3D approximations for rendering complex scenes"): vertices are
-    clustered by a grid, and a face of which two corners meet is left out. Both sides of a seam of the texture move
-    together, so that no gap opens."""
+def simpler(mesh: Mesh, most: int) -> Callable[[Mesh], Mesh] | None:
+    """Return what leaves at most `most` faces of a mesh, or of one that stands elsewhere, or the fewest of a coarse
+    grid; None: it has no more. After Rossignac and Borrel (1993, "Multi-resolution 3D approximations for rendering
+    complex scenes"): vertices are clustered by a grid, and a face of which two corners meet is left out. Both sides of
+    a seam of the texture move together, so that no gap opens."""
     if len(mesh.faces) <= most:
         return None
     low = mesh.vertices.min(axis=0)
@@ -239,7 +224,13 @@ def simpler(mesh: Mesh, most: int) -> Simpler | None:
         faces = faces[(first != second) & (second != third) & (third != first)]
         if len(faces) <= most:
             break
-    return Simpler(kept, places[kept], places, np.unique(faces, axis=0).astype(np.uint32))
+    rest, counts = np.unique(faces, axis=0).astype(np.uint32), np.bincount(places)
+
+    def fewer(whole: Mesh) -> Mesh:
+        mean = np.stack([np.bincount(places, whole.vertices[:, axis]) / counts for axis in range(3)], axis=1)
+        return Mesh(mean[places[kept]].astype(np.float32), rest, whole.normals[kept], whole.uvs[kept])
+
+    return fewer
 
 
 def _key(rows: Ints) -> Ints:

@@ -17,16 +17,14 @@ from advsearch.scene.camera_model import COEFFICIENTS, EQUIRECTANGULAR, NUMBERS,
 from advsearch.scene.importing.files import shown
 
 MOST_PIXELS = 1 << 16  # largest side of a picture
-LARGEST_COEFFICIENT, LARGEST_FOCAL = 1e4, 1e3
-"""Coefficients are at most so large, and focal lengths so many sides of the picture."""
+LARGEST_COEFFICIENT, LARGEST_FOCAL = 1e4, 1e3  # of coefficients, and of focal lengths in sides of the picture
 BENDS = re.compile(
     r"xi|mu|mv|[dkps]\d?|t(au)?[xy]|alpha|beta|gamma\d*|omega|.*dist(?!ance).*|.*skew.*|.*shear.*|.*mirror.*|.*tilt.*|"
     r".*coeff.*|.*flip.*|.*rotate.*|image(rotation|scale)|scale(factor)?|resize.*|(is|image)?rectified|"
     r".*roi.*|.*crop.*|.*binning.*|.*decimat.*|.*fisheye.*|.*lens.*model|.*poly.*|.*affine.*|.*projectionparam.*"
 )
 """Entries, by their plain names, that make another picture: in none of the models that are read, they are refused."""
-OF_RECTIFIED = re.compile(r"r|p|rectificationmatrix|projectionmatrix")
-"""Entries about pictures that are made of the camera's own ones."""
+OF_RECTIFIED = re.compile(r"r|p|rectificationmatrix|projectionmatrix")  # pictures made of its own ones
 QUIET = re.compile(
     # who made it, when, and how well
     r"camera(name|id|info|label|serial.*|index)?|camname|name|label|sensor(type|name|id)?|serial(number)?|comment|version"
@@ -86,8 +84,7 @@ class Entries:
         return number(self.path, name, self.there(name, names))
 
     def numbers(self, shown_as: str, given: object, counts: Sequence[int]) -> list[float]:
-        """Return a list of numbers that is flat, in rows, or in the `data` of a matrix. Raises FileFormatError: it is
-        none, or of another length."""
+        """Return a list of numbers, flat, in rows or in the `data` of a matrix, of a length among some counts."""
         if isinstance(given, Mapping):
             self._odd += [f"{shown_as}.{key}" for key in given if key not in MATRIX_KEYS]
             given = given.get("data")

@@ -15,7 +15,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from advsearch.errors import FileFormatError
-from advsearch.files import MESHES, parse_json, read_text
+from advsearch.files import MESHES, parse_json, parsed, present_text
 from advsearch.scene.camera_entries import Entries, made, nothing, number, plain, with_told
 from advsearch.scene.camera_model import BROWN_CONRADY, COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, CameraModel
 from advsearch.scene.importing.files import shown
@@ -24,8 +24,7 @@ from advsearch.yaml_text import LARGEST, parse_yaml
 
 LARGEST_JSON = 1 << 25  # bytes of a JSON file, which may hold the pose of every picture
 MOST_BINNED = 64  # pixels along a side that a sensor makes into one, at most
-IN_OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
-"""OpenCV's order, which ROS has too."""
+IN_OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")  # as in ROS too
 LENGTHS = (0, 4, 5, 8, 12, 14)  # how many of them there may be
 COLMAP: Mapping[str, tuple[str, str]] = {
     "SIMPLE_PINHOLE": (BROWN_CONRADY, "f cx cy"),
@@ -81,7 +80,7 @@ def read_camera(spec: str) -> CameraModel:
         raise FileFormatError(f"{path}: expected a camera as text, got {CAMERAS[ending]}")
     if ending in MESHES:
         raise FileFormatError(f"{path}: expected a camera file, got a mesh; it is an object's, not a camera's")
-    text = camera_text(path, LARGEST_JSON if ending == ".json" else LARGEST)
+    text = present_text(path, "a camera file", LARGEST_JSON if ending == ".json" else LARGEST)
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
         return _of_colmap(spec, path, which, lines)
@@ -107,18 +106,27 @@ def read_camera(spec: str) -> CameraModel:
 
 def _data(path: str, text: str) -> dict[str, Any]:
     if text.lstrip().startswith("<"):
-        return _xml(path, text)
+        if "<!DOCTYPE" in text or "<!ENTITY" in text:
+            raise FileFormatError(f"{path}: declares a document type or entities, which no camera needs; remove it")
+        root = parsed(path, text, "XML", ElementTree.fromstring)
+        if root.tag != "opencv_storage":
+            raise FileFormatError(
+                f"{path}: expected a camera of OpenCV in <opencv_storage>, got <{root.tag[:40]}>; docs/cameras.md has "
+                "the formats that are read"
+            )
+        entries = dict[str, Any]()
+        for element in root:
+            inner = {entry.tag: (entry.text or "").strip() for entry in element}
+            matrix = element.findtext("data")
+            entries[element.tag] = (inner or (element.text or "").strip()) if matrix is None else matrix.split()
+        return entries
     if path.lower().endswith(".json"):
-        data = read_json(path, text)
+        data = parsed(path, text, "JSON", parse_json)
     else:
         # OpenCV's has a directive and tags of its own
         text = re.sub(r"!!opencv-(nd-)?matrix", "", re.sub(r"\A%YAML[^\n]*\n", "", text))
         text = re.sub(r"\A\s*---[^\n]*\n", "", text).split("\n---")[0]
-        try:
-            data = parse_yaml(text)
-        except ValueError as error:
-            wanted = "expected YAML, or COLMAP's cameras.txt"
-            raise FileFormatError(f"{path}: {wanted}, got {error}; correct the file") from None
+        data = parsed(path, text, "YAML, or COLMAP's cameras.txt", parse_yaml)
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
         got = "an empty file" if data is None else f"a {type(data).__name__}"
         raise FileFormatError(
@@ -126,42 +134,6 @@ def _data(path: str, text: str) -> dict[str, Any]:
             "one of each"
         )
     return data
-
-
-def camera_text(path: str, most: int, what: str = "a camera file") -> str:
-    """Return the text of a file of at most so many bytes. Raises FileFormatError: it is missing, or no such text."""
-    try:
-        return read_text(Path(path), what, most)
-    except OSError as error:
-        raise FileFormatError(f"{path}: expected {what}, got {error.strerror}; check the path") from None
-
-
-def read_json(path: str, text: str) -> Any:
-    """Return what the text of a file says. Raises FileFormatError: it is not JSON."""
-    try:
-        return parse_json(text)
-    except ValueError as error:
-        raise FileFormatError(f"{path}: expected JSON, got {error}; correct the file") from None
-
-
-def _xml(path: str, text: str) -> dict[str, Any]:
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise FileFormatError(f"{path}: declares a document type or entities, which no camera needs; remove it")
-    try:
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError) as error:
-        raise FileFormatError(f"{path}: expected XML, got {error}; correct the file") from None
-    if root.tag != "opencv_storage":
-        raise FileFormatError(
-            f"{path}: expected a camera of OpenCV in <opencv_storage>, got <{root.tag[:40]}>; docs/cameras.md has the "
-            "formats that are read"
-        )
-    entries = dict[str, Any]()
-    for element in root:
-        inner = {entry.tag: (entry.text or "").strip() for entry in element}
-        matrix = element.findtext("data")
-        entries[element.tag] = (inner or (element.text or "").strip()) if matrix is None else matrix.split()
-    return entries
 
 
 def _chosen(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
@@ -261,7 +233,12 @@ def _of_opencv(spec: str, entries: Entries) -> CameraModel:
         raise FileFormatError(f"{path}: expected one model, got a camera_model beside another distortion_model")
     if kind == EQUIRECTANGULAR:
         return with_told(made(spec, kind, _size(entries), {}), entries.told())
-    matrix = _matrix(entries)
+    given = entries.get(*MATRIX)
+    if given is None and entries.get("fx") is not None:  # its numbers one by one
+        fx, fy, cx, cy = (entries.number(name) for name in ("fx", "fy", "cx", "cy"))
+        matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    else:
+        matrix = entries.numbers("camera_matrix", entries.there("camera_matrix", MATRIX), (9,))
     if not any(matrix):
         raise FileFormatError(
             f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, as ROS says of one that is not "
@@ -295,14 +272,6 @@ def _distortion(entries: Entries, names: Sequence[str], counts: Sequence[int]) -
         what = "expected no distortion, as its distortion_model is none"
         raise FileFormatError(f"{entries.path}: {what}, got coefficients")
     return coefficients
-
-
-def _matrix(entries: Entries) -> list[float]:
-    given = entries.get(*MATRIX)
-    if given is None and entries.get("fx") is not None:
-        fx, fy, cx, cy = (entries.number(name) for name in ("fx", "fy", "cx", "cy"))
-        return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-    return entries.numbers("camera_matrix", entries.there("camera_matrix", MATRIX), (9,))
 
 
 def _coefficients(entries: Entries, names: Sequence[str]) -> dict[str, float]:

@@ -24,7 +24,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.polynomial import polynomial
+from numpy.polynomial import Polynomial
 from torch import Tensor
 
 from advsearch.errors import InputError
@@ -35,12 +35,10 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3"
 NUMBERS = (*LINEAR, *COEFFICIENTS)  # what the numbers of a model are, in their order
 OF_KIND: Mapping[str, tuple[str, ...]] = {BROWN_CONRADY: COEFFICIENTS, FISHEYE: COEFFICIENTS[:4], EQUIRECTANGULAR: ()}
 """The coefficients that each kind of model has."""
-
 STEPS = 60  # steps after which an inversion has converged or never does; nearly all take five
 TOLERANCE = 1e-10  # distance, in focal lengths, under which an inversion has converged
 WIDEST = math.tan(math.radians(80.0))  # tangent of the widest half angle that is framed
 FAR = 1e6  # tangents are not looked for beyond this one
-
 Field = Callable[[Tensor], Tensor]
 
 
@@ -58,16 +56,13 @@ class CameraModel:
 
     @property
     def values(self) -> dict[str, float]:
-        """The numbers by name."""
         return dict(zip(NUMBERS, self.numbers, strict=True))
 
     def with_numbers(self, numbers: Tensor) -> CameraModel:
-        """Return the model with other numbers (17,)."""
         return replace(self, numbers=tuple(numbers.double().tolist()))
 
     def check_given(self, given: Iterable[str]) -> None:
-        """Check that nobody asks for the field of view of a camera that has focal lengths of its own. Raises
-        InputError: it is among the settings that are given."""
+        """Refuse, by an InputError, a field of view among given settings: it has focal lengths of its own."""
         if "camera.fov" in given:
             raise InputError(
                 f"`camera={self.name}` and `set` camera.fov contradict each other: the camera has focal lengths of its "
@@ -94,20 +89,14 @@ class CameraModel:
             radius = flat.norm(dim=-1)
             seen = (z > 0.0) & (radius <= self._last)
             bent = self._bent(flat)
-        fx, fy, cx, cy, skew = self.numbers[: len(LINEAR)]
-        column = fx * bent[..., 0] + skew * bent[..., 1] + cx
-        return torch.stack([column, fy * bent[..., 1] + cy], dim=-1), seen
+        (fx, fy, cx, cy, skew), (x, y) = self.numbers[: len(LINEAR)], bent.unbind(dim=-1)
+        return torch.stack([fx * x + skew * y + cx, fy * y + cy], dim=-1), seen
 
     def rays(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the directions in which places (N, 2) in the picture look, and how far inside the view they are.
-
-        Found by Newton's method, kept within bounds by halving, and checked: a place whose inversion has not converged
-        to the branch that the axis lies on is outside.
-
-        Returns:
-            (N, 3) float64, of a fisheye and a panorama unit vectors, else with z = 1; and (N,) float64, over 0 where
-            something is seen: it changes its sign along the edge of that.
-        """
+        """Return the directions (N, 3) float64 in which places (N, 2) in the picture look, of a fisheye and a panorama
+        unit vectors, else with z = 1; and how far inside the view they are, (N,) float64, over 0 where something is
+        seen: it changes its sign along the edge of that. Found by Newton's method, kept within bounds by halving, and
+        checked: a place whose inversion has not converged to the branch that the axis lies on is outside."""
         u, v = places.double().unbind(dim=-1)
         if self.kind == EQUIRECTANGULAR:
             longitude, latitude = (u - 0.5) * (2.0 * torch.pi), (v - 0.5) * torch.pi
@@ -179,27 +168,25 @@ class CameraModel:
     # ---- distortion -------------------------------------------------------------------------------------------------
 
     @cached_property
-    def _polynomials(self) -> tuple[np.ndarray, np.ndarray]:
+    def _polynomials(self) -> tuple[Polynomial, Polynomial]:
         """Numerator and denominator of radial(r) / r in r^2."""
         k = self.numbers[len(LINEAR) :]
         if self.kind == FISHEYE:
-            return np.array([1.0, *k[:4]]), np.ones(1)
-        return polynomial.polytrim([1.0, *k[:3]]), polynomial.polytrim([1.0, *k[3:6]])
+            return Polynomial([1.0, *k[:4]]), Polynomial([1.0])
+        return Polynomial([1.0, *k[:3]]).trim(), Polynomial([1.0, *k[3:6]]).trim()
 
     @cached_property
     def fold(self) -> float:
         """Angle to the axis, radians, at which the radial distortion turns back; infinite if it never does. Beyond it
         two directions are seen in one place, so that no picture tells them apart."""
         over, under = self._polynomials
-        square = np.array([0.0, 2.0])
-        slope = polynomial.polysub(
-            polynomial.polymul(polynomial.polyadd(over, polynomial.polymul(square, polynomial.polyder(over))), under),
-            polynomial.polymul(square, polynomial.polymul(over, polynomial.polyder(under))),
-        )
-        roots = np.concatenate([_positive_roots(slope), _positive_roots(under)])
-        if not roots.size:
+        square = Polynomial([0.0, 2.0])
+        slope = (over + square * over.deriv()) * under - square * (over * under.deriv())
+        roots = np.concatenate([slope.roots(), under.roots()])
+        turns = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
+        if not turns.size:
             return math.inf
-        last = math.sqrt(float(roots.min()))
+        last = math.sqrt(float(turns.min()))
         return last if self.kind == FISHEYE else math.atan(last)
 
     @cached_property
@@ -234,7 +221,19 @@ class CameraModel:
     @cached_property
     def tangents(self) -> tuple[float, float]:
         """Half the sides of a rectangle around the axis, as tangents, that is in the picture as a whole."""
-        edges = self._half_widths()
+        # at first where the picture ends to the nearer side, along its row and its column through the axis
+        middle, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
+        edges = []
+        for axis in (0, 1):
+            line = middle.repeat(512, 1)
+            tangents = []
+            for border in (0.0, 1.0):
+                line[:, axis] = torch.linspace(float(middle[0, axis]), border, 512, dtype=torch.float64)
+                directions, inside = self.rays(line)
+                seen = (inside > 0.0) & (directions[:, 2] > 0.1)
+                aside = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
+                tangents.append(float(torch.where(seen, aside, torch.zeros_like(aside)).max()))
+            edges.append(max(1e-3, min(WIDEST, *tangents)))
         along = torch.linspace(-1.0, 1.0, 17, dtype=torch.float64)
         end = torch.ones_like(along)
         rim = torch.stack([torch.cat([along, along, end, -end]), torch.cat([end, -end, along, along])], dim=-1)
@@ -245,21 +244,6 @@ class CameraModel:
             if bool((seen & (places >= -1e-6).all(dim=-1) & (places <= 1.0 + 1e-6).all(dim=-1)).all()):
                 break
         return share * edges[0], share * edges[1]
-
-    def _half_widths(self) -> tuple[float, float]:
-        middle, _ = self.project(torch.tensor([[0.0, 0.0, 1.0]]))
-        widths = []
-        for axis in (0, 1):
-            line = middle.repeat(512, 1)
-            tangents = []
-            for end in (0.0, 1.0):
-                line[:, axis] = torch.linspace(float(middle[0, axis]), end, 512, dtype=torch.float64)
-                directions, inside = self.rays(line)
-                seen = (inside > 0.0) & (directions[:, 2] > 0.1)
-                aside = directions[:, axis].abs() / directions[:, 2].clamp_min(0.1)
-                tangents.append(float(torch.where(seen, aside, torch.zeros_like(aside)).max()))
-            widths.append(min(WIDEST, *tangents))
-        return max(widths[0], 1e-3), max(widths[1], 1e-3)
 
     @cached_property
     def black(self) -> float:
@@ -294,8 +278,7 @@ class CameraModel:
 
 
 def pinhole(fov: float, aspect: float) -> CameraModel:
-    """Return the model of a camera without distortion, with a field of view along the larger side, degrees, and an
-    aspect of width over height."""
+    """Return the model of a camera without distortion, by field of view (degrees, larger side) and aspect."""
     focal = 0.5 / math.tan(math.radians(fov) / 2.0)
     linear = (focal * max(1.0, 1.0 / aspect), focal * max(1.0, aspect), 0.5, 0.5, 0.0)
     return CameraModel(BROWN_CONRADY, (*linear, *[0.0] * len(COEFFICIENTS)))
@@ -305,24 +288,13 @@ def bundled(aspect: float = 1.0) -> Mapping[str, CameraModel]:
     """Return the models that need no file, by name, for a picture of a shape."""
     half, none = 1.0 / math.pi, [0.0] * len(COEFFICIENTS)
     ideal = (half * min(1.0, 1.0 / aspect), half * min(1.0, aspect), 0.5, 0.5, 0.0, *none)
-    whole = (1.0, 1.0, 0.5, 0.5, 0.0, *none)
-    return {
-        FISHEYE: CameraModel(FISHEYE, ideal, FISHEYE, reach=90.0),
-        EQUIRECTANGULAR: CameraModel(EQUIRECTANGULAR, whole, EQUIRECTANGULAR),
-    }
+    panorama = CameraModel(EQUIRECTANGULAR, (1.0, 1.0, 0.5, 0.5, 0.0, *none), EQUIRECTANGULAR)
+    return {FISHEYE: CameraModel(FISHEYE, ideal, FISHEYE, reach=90.0), EQUIRECTANGULAR: panorama}
 
 
-def _positive_roots(coefficients: np.ndarray) -> np.ndarray:
-    trimmed = polynomial.polytrim(np.asarray(coefficients, dtype=np.float64))
-    roots = polynomial.polyroots(trimmed) if len(trimmed) > 1 else np.zeros(0)
-    real = roots.real[np.abs(roots.imag) <= 1e-9 * np.abs(roots)]
-    return np.asarray(real[real > 0.0])
-
-
-def _evaluated(coefficients: np.ndarray, at: Tensor) -> Tensor:
-    """A polynomial, lowest power first."""
-    value = torch.full_like(at, float(coefficients[-1]))
-    for coefficient in coefficients[-2::-1]:
+def _evaluated(of: Polynomial, at: Tensor) -> Tensor:
+    value = torch.full_like(at, float(of.coef[-1]))
+    for coefficient in of.coef[-2::-1]:
         value = value * at + float(coefficient)
     return value
 

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Values = TypeVar("Values", Floats, "Tensor")
-
 LOW_END = 0.0031308  # linear values up to which the encoding is straight
 
 

@@ -22,11 +22,12 @@ from torch import Tensor
 
 from advsearch import files
 from advsearch.errors import AdvsearchError, FileFormatError
-from advsearch.scene.assets import Material, Mesh, Shape
+from advsearch.scene.assembly import posed
+from advsearch.scene.assets import Material, Mesh, Shape, pose_of
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.glb import glb, posed
+from advsearch.scene.glb import glb
 from advsearch.scene.grounds import paved
 from advsearch.scene.importing.blender import command, last_line, surroundings
 from advsearch.scene.parts import BallLamp, MeshPart, PointLamp
@@ -123,13 +124,11 @@ class BlenderError(AdvsearchError):
 
 
 class Cycles:
-    """Renders the configurations of one scene at a resolution (height, width) by Cycles, with light paths of at most so
+    """Renders the configurations of one scene at a size (height, width) by Cycles, with light paths of at most so
     many segments, and with Blender's Open Image Denoise or without. Raises BlenderError: there is no Blender, or the
     scene has what is not carried over."""
 
-    def __init__(
-        self, description: SceneDescription, resolution: tuple[int, int], *, max_depth: int, denoise: bool
-    ) -> None:
+    def __init__(self, description: SceneDescription, size: tuple[int, int], *, max_depth: int, denoise: bool) -> None:
         try:
             self._command = command("Blender's Cycles has to render it", "leave `ways=blender` out")
         except FileFormatError as error:
@@ -141,17 +140,16 @@ class Cycles:
         unknown += ["a plain background"] if description.backdrop else []
         if unknown:
             raise BlenderError(f"the scene has {', '.join(unknown[:5])}, which is not carried over to Blender")
-        self._description, self._resolution = description, resolution
+        self._description, self._resolution = description, size
         self._depth, self._denoise = max_depth, denoise
         self._held: dict[str, Tensor] = {}
         self._process: _Process | None = None
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Render linear radiance (H, W, 3); arguments as for `MitsubaScene.radiance`. Raises BlenderError: Blender
-        stopped, or took too long."""
+        """Render linear radiance (H, W, 3), as `MitsubaScene.radiance`. Raises BlenderError: Blender stopped."""
         held = self._held
-        same = self._process is not None and held.keys() == inputs.keys()
-        if self._process is None or not (same and all(torch.equal(held[name], inputs[name]) for name in inputs)):
+        same = held.keys() == inputs.keys() and all(torch.equal(held[name], inputs[name]) for name in inputs)
+        if self._process is None or not same:
             self._process = None
             self._process = _Process(self._command, *self._told(inputs))
             self._held = {name: value.detach().clone() for name, value in inputs.items()}
@@ -170,8 +168,7 @@ class Cycles:
         for lamp in scene.lamps.values():
             place, shape = np.eye(4), list[list[float]]()
             if isinstance(lamp, BallLamp):
-                ball = np.diag([lamp.radius] * 3 + [1.0])
-                ball[:3, 3] = lamp.place
+                ball = pose_of(lamp.radius * np.eye(3), lamp.place)
                 shape = values.get(f"{lamp.name}.ball", torch.from_numpy(ball)).double().tolist()
                 color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
             else:

@@ -18,21 +18,12 @@ import torch
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import reading
-from advsearch.scene import library, settings
+from advsearch.scene import geometry, library, settings
 from advsearch.scene.assets import TRIPOD, Doubles, EnvironmentAsset, Material, ObjectAsset, doubts, on_roads, sized
 from advsearch.scene.camera_entries import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
 from advsearch.scene.formation import metered_gain
-from advsearch.scene.geometry import (
-    camera_to_world,
-    driving,
-    framing_distance,
-    moved_part,
-    object_to_world,
-    seated,
-    standing,
-)
 from advsearch.scene.grounds import Photograph, on_its_ground, paved, photograph_of
 from advsearch.scene.headlamps import with_lamps
 from advsearch.scene.importing.objects import import_object
@@ -115,15 +106,31 @@ class SceneDescription:
         and another is to see it; or a file cannot be used."""
         if camera in PRESETS and camera not in self.cameras:
             return self._mounted(camera)
+        seen = replace(self, camera=ORBIT_CAMERA, camera_model=None)
         if camera not in (ORBIT_CAMERA, *self.cameras):
-            return self._with_model(camera)
+            if not is_path(camera) and camera not in bundled():
+                known = (ORBIT_CAMERA, *self.cameras, *bundled(), *PRESETS)
+                raise UnknownNameError(
+                    "camera", camera, known, "Or give the path of a camera file, such as calib.yaml."
+                )
+            model = bundled().get(camera)
+            if is_path(camera) and (rig := read_rig(camera)):
+                model, fov = rig[0].model, rig[0].fov
+                seen = replace(seen, rig=rig, rig_spec=camera)
+                seen = seen if fov is None else seen.with_values(camera__fov=fov)
+            elif is_path(camera):
+                with reading(camera.partition("#")[0]):
+                    model = read_camera(camera)
+            if model is not None:
+                model.check_given(self.given)
+            return replace(seen, camera_model=model)
         idle = sorted(name for name in self.given if name.startswith("camera.") and name != "camera.exposure")
         if camera != ORBIT_CAMERA and idle:
             raise InputError(
                 f"`camera={camera}` and `set` {idle[0]} contradict each other: the camera of the file has a place and "
                 "a field of view of its own; leave one of the two out"
             )
-        return replace(self, camera=camera, camera_model=None)
+        return replace(seen, camera=camera)
 
     def _mounted(self, name: str) -> SceneDescription:
         preset, own = PRESETS[name], {"camera.fov": PRESETS[name].fov}
@@ -145,30 +152,15 @@ class SceneDescription:
         if "camera.distance" in self.given:
             return seen
         fov = torch.tensor(seen.number("camera.fov"), dtype=torch.float64)
-        fitted = float(framing_distance(seen, fov, seen.aspect)) * seen.metres
+        fitted = float(geometry.framing_distance(seen, fov, seen.aspect)) * seen.metres
         return seen.with_values(camera__distance=max(preset.distance, fitted))
-
-    def _with_model(self, name: str) -> SceneDescription:
-        if not is_path(name) and name not in bundled():
-            known = (ORBIT_CAMERA, *self.cameras, *bundled(), *PRESETS)
-            raise UnknownNameError("camera", name, known, "Or give the path of a camera file, such as calib.yaml.")
-        seen, model = replace(self, camera=ORBIT_CAMERA), bundled().get(name)
-        if is_path(name) and (rig := read_rig(name)):
-            model, fov = rig[0].model, rig[0].fov
-            seen = replace(seen, rig=rig, rig_spec=name)
-            seen = seen if fov is None else seen.with_values(camera__fov=fov)
-        elif is_path(name):
-            with reading(name.partition("#")[0]):
-                model = read_camera(name)
-        if model is not None:
-            model.check_given(self.given)
-        return replace(seen, camera_model=model)
 
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
         """Every mesh by name, as the settings have it; the one under test is `OBJECT`."""
-        under_test = mesh_part(OBJECT, self.object, object_to_world(self), self.material)
-        meshes = {OBJECT: under_test, **{name: moved_part(part, self.values) for name, part in self.around.items()}}
+        around = {name: geometry.moved_part(part, self.values) for name, part in self.around.items()}
+        object_part = mesh_part(OBJECT, self.object, geometry.object_to_world(self), self.material)
+        meshes = {OBJECT: object_part, **around}
         glasses = {name: mesh for name, mesh in meshes.items() if isinstance(mesh, LampGlass)}
         return meshes | {name: replace(one, to_world=meshes[one.carrier].to_world) for name, one in glasses.items()}
 
@@ -184,12 +176,10 @@ class SceneDescription:
 
     @property
     def cut_out(self) -> bool:
-        """Whether a mesh has cut-outs."""
         return any(mesh.opacity is not None for mesh in self.meshes.values()) or self._has("mask")
 
     @property
     def normal_mapped(self) -> bool:
-        """Whether a mesh has a normal map."""
         return any(mesh.normal_map is not None for mesh in self.meshes.values()) or self._has("normalmap", "bumpmap")
 
     def _has(self, *kinds: str) -> bool:
@@ -199,7 +189,6 @@ class SceneDescription:
 
     @property
     def emits(self) -> bool:
-        """Whether a mesh emits light."""
         return any(mesh.emission is not None for mesh in self.meshes.values())
 
     @property
@@ -212,10 +201,10 @@ class SceneDescription:
         if not isinstance(part, BeamLamp):
             return self.meshes.get(part.name, part)
         if part.carrier == CAMERA:
-            carrier = driving(torch.from_numpy(camera_to_world(self)))
+            carrier = geometry.driving(torch.from_numpy(geometry.camera_to_world(self)))
         else:
             carrier = torch.from_numpy(self.meshes[part.carrier].to_world)
-        return replace(part, to_world=seated(carrier, torch.from_numpy(part.seat)).numpy())
+        return replace(part, to_world=geometry.seated(carrier, torch.from_numpy(part.seat)).numpy())
 
     @property
     def lit(self) -> bool:
@@ -225,8 +214,7 @@ class SceneDescription:
 
     @property
     def metres(self) -> float:
-        """What lengths in metres are to be divided by to be in object sizes, the scene's own unit: the object's size in
-        metres; 1 where it has none."""
+        """What lengths in metres are to be divided by to be in object sizes: the object's size in metres, or 1."""
         return self.object.metres or 1.0
 
     @property
@@ -247,12 +235,6 @@ class SceneDescription:
         size = doubts(self.object, asked=self.size is not None, laid=paved(self))
         return tuple(dict.fromkeys((*self.object.notes, *size, *lit, *seen, *self.remarks)))
 
-    @property
-    def bundled_environment(self) -> str | None:
-        """Name of the environment if it is a bundled one."""
-        own = self.environment
-        return own.name if own is not None and own.source == library.BUNDLED_ENVIRONMENT else None
-
     def environment_for(self, who: str) -> EnvironmentAsset:
         """Return the environment for what cannot do without a map. Raises InputError: the scene has none."""
         if self.environment is None:
@@ -263,7 +245,7 @@ class SceneDescription:
     @property
     def base_vertices(self) -> Doubles:
         """(V, 3) the object's vertices in world space, in its base pose."""
-        return standing(self.meshes[OBJECT])
+        return geometry.standing(self.meshes[OBJECT])
 
     def number(self, name: str) -> float:
         """Return a setting that always has a value; of the field of view, that of the camera in use."""
@@ -343,25 +325,10 @@ def describe(
     plugins: Mapping[str, object] | None = None,
     things: str | None = None,
 ) -> SceneDescription:
-    """Find and read an object and an environment, bundled or from a file.
-
-    Args:
-        object_spec: a bundled name, a path to a mesh, an asset, or "scene.glb#chair": a node of a glTF scene, or a
-            shape of a Mitsuba scene (.xml) by its id, the rest of which stays around it, without the ground plane, and
-            without a map if it has lights of its own.
-        environment_spec: a bundled name, a path to an .hdr or .exr file, an asset, `NO_MAP` for no map at all, or None
-            for the default.
-        given: settings to fix, by name.
-        up: "y" or "z", the up axis of a mesh file; None takes what its format or else its shape says.
-        size: of the object, its longest side in metres.
-        unit: of the coordinates of its file, one of `advsearch.scene.assets.UNITS`; without both its size is what its
-            format says.
-        plugins: a Mitsuba scene as its loader takes it, in which `object_spec` is the id of a shape.
-        things: what stands beside the object (`advsearch.scene.things`).
-
-    Raises:
-        InputError: a name is unknown, a file cannot be used, or a setting is out of range.
-    """
+    """Find and read an object and an environment, bundled or from a file; arguments and errors as of
+    `advsearch.load_scene`. What stands around a node of a glTF scene or a shape of a Mitsuba scene stays there, without
+    the ground plane, and without a map if it has lights of its own; `plugins` are a Mitsuba scene as its loader takes
+    it, in which `object_spec` is the id of a shape; an environment of `NO_MAP` is no map at all."""
     given = given or {}
     values = settings.resolve(given)
     file, node = split_node(object_spec) if isinstance(object_spec, str) else (object_spec, None)

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Ints, face_vectors
 from advsearch.scene.color import LOW_END, linear_to_srgb, srgb_to_linear
-from advsearch.scene.geometry import NEAREST, camera_to_world, object_to_world, standing
+from advsearch.scene.geometry import NEAREST, camera_to_world, object_to_world, rotation, standing
 from advsearch.scene.grounds import paved
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import looked_up, pixels_in
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
 DENOISERS = ("oidn", "none")
-FILTERS = ("box", "gaussian")
 SAMPLERS = ("independent", "multijitter")  # samplers of a run's image formation; `advsearch precision` compares more
 SAMPLER = "multijitter"  # the one that is taken where nobody asks: its pictures are as good with a third of the samples
 PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61, 67, 71, 73, 79, 83, 89, 97, 101)
@@ -44,7 +43,7 @@ class ImageFormation:
     """How a picture is formed."""
 
     denoiser: str = "oidn"  # or "none": Intel Open Image Denoise with albedo and normals as guides
-    filter: str = "box"  # of reconstruction, or "gaussian", which correlates pixels, so that the denoiser refuses it
+    filter: ClassVar[str] = "box"  # of reconstruction: all others correlate pixels, and then the denoiser does nothing
     # how samples are spread over a pixel: "multijitter" (Kensler 2013, Correlated multi-jittered sampling), or
     # "independent", whose noise is more
     sampler: str = SAMPLER
@@ -59,17 +58,10 @@ class ImageFormation:
     quick: bool = False  # the denoiser takes some 0.6 of its time and leaves a little more error
 
     def __post_init__(self) -> None:
-        for name, chosen, known in (
-            ("denoise", self.denoiser, DENOISERS),
-            ("pixel_sampler", self.sampler, SAMPLERS),
-            ("reconstruction filter", self.filter, FILTERS),
-        ):
-            if chosen not in known:
-                raise InputError(f"{name}: expected one of {', '.join(known)}, got {chosen!r}")
-        if self.denoiser == "oidn" and self.filter != "box":
-            raise InputError(
-                "the denoiser needs the box filter: any other correlates pixels; use `denoise=none` with it"
-            )
+        if self.denoiser not in DENOISERS:
+            raise InputError(f"denoise: expected one of {', '.join(DENOISERS)}, got {self.denoiser!r}")
+        if self.sampler not in SAMPLERS:
+            raise InputError(f"pixel_sampler: expected one of {', '.join(SAMPLERS)}, got {self.sampler!r}")
         if min(self.resolution) < 8 or max(self.resolution) > 4096:
             raise InputError(f"resolution: expected 8 to 4096 pixels, got {self.resolution}")
 
@@ -128,10 +120,10 @@ def next_count(sampler: str, samples: float) -> int:
     squares of primes, the low-discrepancy sequence in powers of four."""
     whole = max(1, math.ceil(samples - 1e-9))
     root = math.isqrt(whole - 1) + 1
+    wide = max(1, math.isqrt(whole))
     if sampler == "stratified":
         return root**2
     if sampler == "multijitter":
-        wide = max(1, math.isqrt(whole))
         return wide * math.ceil(whole / wide)
     if sampler == "orthogonal":
         return next((prime for prime in PRIMES if prime >= root), PRIMES[-1]) ** 2
@@ -174,16 +166,11 @@ NOTHING: frozenset[str] = frozenset()  # leave out nothing: what a program has t
 
 RASTER = 32  # pixels along the longer side of the picture in which the surface is looked at
 ROWS = 32  # rows to which an environment is summed up: irradiance varies slowly
-
-
 WHITE = 0.8  # reflectance of the card that is metered
 METERED_WHITE = 0.5  # linear display value that it gets, on average over what the camera sees of the object
-
-
 _NINTHS = [(a, b) for a in range(4) for b in range(4 - a)]
 WITHIN = np.array([(3 * a + 1, 3 * b + 1, 10 - 3 * a - 3 * b) for a, b in _NINTHS]) / 12.0
 """Barycentric weights (10, 3) of the places of a face at which its radiance is looked up."""
-
 MOVED = ("camera.", "pose.", "environment.")
 """Settings whose defaults are metered, by the beginning of their names: those that controls move."""
 
@@ -227,12 +214,9 @@ def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
 
 
 def arriving(scene: SceneDescription) -> tuple[Doubles, Doubles, Doubles]:
-    """Return unit directions (N, 3) from which the environment lights the scene, their solid angles (N,), and radiance
-    times these (N, 3)."""
+    """Return unit directions (N, 3) to the environment's light, solid angles (N,), and radiance times these."""
     directions, solid, power = _arriving(scene.environment)
-    turn = math.radians(scene.number("environment.rotation"))
-    cosine, sine = math.cos(turn), math.sin(turn)
-    return directions @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]), solid, power
+    return directions @ rotation(scene.number("environment.rotation"), 0.0, 0.0).T, solid, power
 
 
 def _emitted(part: MeshPart, emission: Floats, place: Doubles) -> tuple[Doubles, Doubles]:
@@ -285,16 +269,10 @@ def _arriving(environment: EnvironmentAsset | None) -> tuple[Doubles, Doubles, D
     fine = np.concatenate([environment.radiance, np.ones((height, width, 1))], axis=2) * solid[:, None, None]
     summed = np.add.reduceat(np.add.reduceat(fine, rows, axis=0), columns, axis=1).reshape(-1, 4)
     ends_r, ends_c = np.append(rows[1:], height), np.append(columns[1:], width)
-    theta = (rows + ends_r - 1) * (0.5 * math.pi / (height - 1))
+    theta = (rows + ends_r - 1)[:, None] * (0.5 * math.pi / (height - 1))
     azimuth = 0.5 * math.pi - (columns + ends_c) * (math.pi / width)
-    directions = np.stack(
-        [
-            np.sin(theta)[:, None] * np.cos(azimuth),
-            np.sin(theta)[:, None] * np.sin(azimuth),
-            np.broadcast_to(np.cos(theta)[:, None], (len(rows), len(columns))),
-        ],
-        axis=-1,
-    )
+    up = np.broadcast_to(np.cos(theta), (len(rows), len(columns)))
+    directions = np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), up], axis=-1)
     return directions.reshape(-1, 3), summed[:, 3], summed[:, :3]
 
 
@@ -332,16 +310,10 @@ class Moment:
 
 
 def moments_of(shutter: float, rolling: float, height: int, count: int) -> tuple[Tensor, Tensor, float]:
-    """Return when moments are, how much each counts, and the part of a pixel's samples that each takes.
-
-    Args:
-        shutter, rolling: seconds that each row is exposed, and from the first row to the end of the last, at least 0.
-        height: rows of the picture.
-        count: moments M. With as many as rows and no shutter, each row has the moment of its own.
-
-    Returns:
-        Seconds from the middle of the exposure (M,), and shares of the rows (M, H), whose columns add up to 1.
-    """
+    """Return when so many moments M are, in seconds from the middle of the exposure (M,); their shares of the rows of a
+    picture (M, H), whose columns add up to 1; and the part of a pixel's samples that each takes. Each row is exposed
+    for `shutter` seconds, and rows are read within `rolling` seconds, both at least 0; with as many moments as rows and
+    no shutter, each row has the moment of its own."""
     cell = (shutter + rolling) / count
     begins = torch.arange(count, dtype=torch.float64) * cell
     opens = rolling * (torch.arange(height, dtype=torch.float64) + 0.5) / height

@@ -25,38 +25,36 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Doubles
+from advsearch.scene.assets import Doubles, pose_of
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import ORBIT_CAMERA, POSE, SETTINGS
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
-FRAME_FILL = 0.86
-"""Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
+FRAME_FILL = 0.86  # share of the picture's half-width that the object may reach when the distance is worked out
 CLEARANCE = 0.02  # smallest distance, in object sizes, to the sphere around the object
-STEEPEST = math.sin(math.radians(89.0))
-"""Sine of the elevation at which a camera stays that is to be higher above the object than it is away."""
+STEEPEST = math.sin(math.radians(89.0))  # sine of the largest elevation, for a height that would need a steeper one
 NEAREST = 1e-3  # depth up to which points have no place in the picture
 DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
 
 
 def framing_distance(description: SceneDescription, fov: Tensor, aspect: float) -> Tensor:
     """Return the distance of the camera to the middle of a scene's object, () float64 in object sizes, for a field of
-    view () along the larger side of the picture, degrees, and an aspect of width over height; differentiable in the
-    first."""
-    offsets, edge = _offsets(description).to(fov.device), _edge(description, fov, aspect)
+    view () along the larger side of the picture, degrees, and its width over height; differentiable in the first."""
+    offsets = torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description)).to(fov.device)
+    model = description.camera_model
+    if model is not None and model.name:  # of what it shows, a rectangle
+        edge = torch.tensor(model.tangents, dtype=torch.float64, device=fov.device)
+    else:
+        shape = torch.tensor([min(1.0, aspect), min(1.0, 1.0 / aspect)], dtype=torch.float64, device=fov.device)
+        edge = torch.tan(torch.deg2rad(fov.double()) / 2.0) * shape
     azimuth, elevation, roll = (float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW)
-    fits = _from_one_side(offsets, camera_axes(azimuth, elevation, roll), edge * FRAME_FILL)
+    axes = torch.from_numpy(camera_axes(azimuth, elevation, roll)).T.to(offsets)
+    (left, up, outwards), (wide, high) = offsets.matmul(axes).unbind(dim=1), edge * FRAME_FILL
+    fits = (outwards + torch.maximum(left.abs() / wide, up.abs() / high)).max()
     whole = _from_all_around(offsets, elevation, edge)
     return torch.maximum(fits, whole).clamp_min(float(offsets.norm(dim=1).max()) + CLEARANCE)
-
-
-def filling_distance(description: SceneDescription) -> float:
-    """Return the distance at which the object just fits into a square picture from where this scene's camera looks."""
-    edge = _edge(description, torch.tensor(description.number("camera.fov"), dtype=torch.float64), 1.0)
-    axes = camera_axes(*(description.number(name) for name in DEFAULT_VIEW))
-    return float(_from_one_side(_offsets(description), axes, edge * FRAME_FILL))
 
 
 def camera_axes(azimuth: float, elevation: float, roll: float) -> Doubles:
@@ -64,37 +62,18 @@ def camera_axes(azimuth: float, elevation: float, roll: float) -> Doubles:
     for the camera's direction around the object, its height above the ground plane, and the picture's rotation,
     counter-clockwise, all in degrees."""
     azimuth, elevation, roll = math.radians(azimuth), math.radians(elevation), math.radians(roll)
-    outwards = np.array(
-        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
-    )
+    level, up = math.cos(elevation), math.sin(elevation)
+    outwards = np.array([level * math.cos(azimuth), level * math.sin(azimuth), up])
     left = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
-    up = np.cross(-outwards, left)
-    left, up = math.cos(roll) * left + math.sin(roll) * up, math.cos(roll) * up - math.sin(roll) * left
-    return np.stack([left, up, outwards])
+    upright = np.cross(-outwards, left)
+    turned = math.cos(roll) * left + math.sin(roll) * upright, math.cos(roll) * upright - math.sin(roll) * left
+    return np.stack([*turned, outwards])
 
 
 def middle(description: SceneDescription) -> Doubles:
     """Return what the camera looks at: the middle (3,) of the object's bounding box in its default pose."""
     vertices = description.object.mesh.vertices.astype(np.float64)
     return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
-
-
-def _offsets(description: SceneDescription) -> Tensor:
-    return torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description))
-
-
-def _edge(description: SceneDescription, fov: Tensor, aspect: float) -> Tensor:
-    """Tangents of half the picture's width and height, (2,); of a lens, those of what it shows of a rectangle."""
-    model = description.camera_model
-    if model is not None and model.name:
-        return torch.tensor(model.tangents, dtype=torch.float64, device=fov.device)
-    shape = torch.tensor([min(1.0, aspect), min(1.0, 1.0 / aspect)], dtype=torch.float64, device=fov.device)
-    return torch.tan(torch.deg2rad(fov.double()) / 2.0) * shape
-
-
-def _from_one_side(offsets: Tensor, axes: Doubles, tangents: Tensor) -> Tensor:
-    left, up, outwards = offsets.matmul(torch.from_numpy(axes).T.to(offsets)).unbind(dim=1)
-    return (outwards + torch.maximum(left.abs() / tangents[0], up.abs() / tangents[1])).max()
 
 
 def _from_all_around(offsets: Tensor, elevation: float, tangents: Tensor) -> Tensor:
@@ -138,8 +117,7 @@ def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
     stands, by those that are called `pose:NAME.yaw` and so on."""
     pose = {own.name: value for own in POSE if (value := values.get(f"pose:{part.name}.{own.name}")) is not None}
     if pose:
-        places = standing(part)
-        pose = {**{own.name: float(own.default) for own in POSE}, **pose}
+        places, pose = standing(part), {**{own.name: float(own.default) for own in POSE}, **pose}
         part = replace(part, to_world=_posed(places, float(places[:, 2].min()), pose) @ part.to_world)
     return replace(part, material=part.material.with_values(values, f"material:{part.name}."))
 
@@ -155,11 +133,9 @@ def _posed(places: Doubles, floor: float, pose: Mapping[str, float]) -> Doubles:
     middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
     linear = pose["scale"] * rotation(pose["yaw"], pose["pitch"], pose["roll"])
     lowest = float(((places - middle) @ linear.T)[:, 2].min())
-    matrix = np.eye(4)
-    matrix[:3, :3] = linear
-    matrix[:3, 3] = np.array([pose["x"], pose["y"], floor + pose["z"] - lowest]) - linear @ middle
-    matrix[:2, 3] += middle[:2]
-    return matrix
+    place = np.array([pose["x"], pose["y"], floor + pose["z"] - lowest]) - linear @ middle
+    place[:2] += middle[:2]
+    return pose_of(linear, place)
 
 
 def camera_to_world(description: SceneDescription, aspect: float | None = None) -> Doubles:
@@ -171,19 +147,16 @@ def camera_to_world(description: SceneDescription, aspect: float | None = None) 
         return description.cameras[description.camera].to_world
     aspect = description.aspect if aspect is None else aspect
     number = description.number
-    asked = description.values["camera.distance"]
-    distance = 0.0 if asked is None else asked / description.metres
-    if asked is None:
+    if (asked := description.values["camera.distance"]) is not None:
+        distance = asked / description.metres
+    else:
         distance = float(framing_distance(description, torch.tensor(number("camera.fov"), dtype=torch.float64), aspect))
     elevation, height = number("camera.elevation"), description.values.get("camera.height")
     if height is not None:
         above = (height / description.metres - float(middle(description)[2])) / distance
         elevation = math.degrees(math.asin(min(max(above, -STEEPEST), STEEPEST)))
     axes = camera_axes(number("camera.azimuth"), elevation, number("camera.roll"))
-    matrix = np.eye(4)
-    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = axes[0], axes[1], -axes[2]
-    matrix[:3, 3] = middle(description) + distance * axes[2]
-    return matrix
+    return pose_of(np.stack([axes[0], axes[1], -axes[2]], axis=1), middle(description) + distance * axes[2])
 
 
 def projected(
@@ -208,8 +181,7 @@ def projected(
 
 
 def seated(carrier: Tensor, seat: Tensor) -> Tensor:
-    """Return the rigid pose (4, 4) of what sits at `seat` (4, 4) on what has the pose `carrier` (4, 4), which may be
-    scaled; differentiable."""
+    """Return the rigid pose (4, 4) of what sits at a seat (4, 4) on a carrier (4, 4), which may be scaled."""
     scale = torch.linalg.det(carrier[:3, :3]).abs() ** (1.0 / 3.0)
     return affine(carrier[:3, :3] / scale @ seat[:3, :3], carrier[:3, :3] @ seat[:3, 3] + carrier[:3, 3])
 

@@ -9,21 +9,16 @@ from __future__ import annotations
 import io
 import json
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from PIL import Image
-from torch import Tensor
 
 from advsearch.pictures import png_of
-from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Doubles, Floats, Shape
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.parts import MeshPart
 
 # ---- The buffer of a binary glTF file, and the file around it -------------------------------------------------------
 
@@ -78,28 +73,11 @@ class GlbBuffer:
 Levels = npt.NDArray[np.uint8]
 COAT_ROUGHNESS = 0.316  # of Mitsuba's clearcoat, whose alpha is 0.1: the square root of it
 PLAIN = 0.5  # specular of a surface whose index of refraction is 1.5
-WEB_SIDE, WEB_QUALITY = 1024, 90
-"""Longest side in pixels of a texture in a file for the web, and the quality of its JPEG, from 1 to 95."""
-CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
-"""The camera of such a file: its place counts."""
-
-
-def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> Shape:
-    """Return a mesh of a scene as its inputs, those of `MitsubaScene` that differ from the base values, have it: in
-    world space, z up."""
-    begin = f"{part.name}."
-    own = {key.removeprefix(begin): value.detach().cpu() for key, value in inputs.items() if key.startswith(begin)}
-    places = dict(zip(("vertices", "normals"), MovingMesh(part.mesh, part.to_world).place(None, None), strict=True))
-    rows = {name: own.get(name, flat).reshape(-1, 3).to(torch.float32).numpy() for name, flat in places.items()}
-    mesh, color = replace(part.mesh, vertices=rows["vertices"], normals=rows["normals"]), part.base_color
-    if "base_color" in own:
-        color = linear_to_srgb(own["base_color"].clamp(0.0, 1.0)).numpy()
-    material = replace(part.material, **{key: float(own[key]) for key in vars(part.material) if key in own})
-    return replace(part, mesh=mesh, base_color=color, material=material, to_world=np.eye(4))
+WEB_SIDE, WEB_QUALITY = 1024, 90  # longest side of a texture in a file for the web, and the quality of its JPEG
+CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}  # its place counts
 
 
 def glb(meshes: Sequence[Shape]) -> bytes:
-    """Return a binary glTF file of some meshes."""
     made = GlbBuffer()
     return made.file(_described(made, meshes, png_of))
 
@@ -146,9 +124,8 @@ def _described(made: GlbBuffer, meshes: Sequence[Shape], picture: Callable[[Leve
         }
         whole = np.uint32 if len(mesh.vertices) > np.iinfo(np.uint16).max else np.uint16
         indices = made.accessor(mesh.faces.reshape(-1).astype(whole), "SCALAR")
-        header["meshes"].append(
-            {"name": shape.name, "primitives": [{"attributes": corners, "indices": indices, "material": number}]}
-        )
+        primitive = {"attributes": corners, "indices": indices, "material": number}
+        header["meshes"].append({"name": shape.name, "primitives": [primitive]})
         levels = _levels(shape.base_color)
         encoded = picture(levels) if shape.opacity is None else _cut_out_png(levels, _levels(shape.opacity))
         material = _material(shape, _texture(header, made, encoded))
@@ -198,10 +175,9 @@ def _levels(color: Floats) -> Levels:
 
 
 def _cut_out_png(color: Levels, opacity: Levels) -> bytes:
-    file, picture = io.BytesIO(), Image.fromarray(color)
+    picture = Image.fromarray(color)
     picture.putalpha(Image.fromarray(opacity).resize(picture.size, Image.Resampling.BILINEAR))
-    picture.save(file, "PNG")
-    return file.getvalue()
+    return png_of(np.asarray(picture))
 
 
 def _jpeg(color: Levels) -> bytes:

@@ -55,12 +55,10 @@ class Group:
 
     @property
     def coordinates(self) -> slice:
-        """Where the group lies in u."""
         return slice(self.begin, self.begin + self.size)
 
     @cached_property
     def name(self) -> str:
-        """`control.parameter`."""
         return f"{self.control}.{self.parameter}"
 
     @property
@@ -87,17 +85,21 @@ ESTIMATORS: Mapping[str, str] = {
     "none": "no derivative: a discrete choice, or switched off",
 }
 """Every estimator by the name that forces it."""
-
 BY_ADJOINT = frozenset({"adjoint", "material"})
-ALWAYS_VALID = ("differences", "secant", "none")
-"""Estimators that need nothing but renders, so they can be forced on any continuous coordinate."""
+ALWAYS_VALID = ("differences", "secant", "none")  # they need nothing but renders: right for any continuous coordinate
 MANY = 16  # coordinates over which differences are not compared with an adjoint: one by one they take too many renders
-
 DEFAULT_STEP, TURN_STEP = 0.05, 0.005
 """Half of a difference's width in u, for coordinates that move nothing in the picture: of a range, of a full turn."""
-DEFAULT_PIXELS = 1.0
-"""Pixels by which the fastest point of an outline moves in half a difference (docs/gradients.md, "The estimators")."""
+DEFAULT_PIXELS = 1.0  # of the fastest point of an outline in half a difference (docs/gradients.md, "The estimators")
 STEP_RANGE = (1e-6, 0.15)  # smallest and largest step in u
+
+
+def steps_for(speeds: Tensor) -> Tensor:
+    """Return half-widths of differences in u over which outlines of such speeds, pixels a unit, move by a pixel."""
+    moved = torch.where(speeds > 1e-3, DEFAULT_PIXELS / speeds.clamp_min(1e-3), torch.full_like(speeds, DEFAULT_STEP))
+    return moved.clamp(*STEP_RANGE)
+
+
 SEARCH_STEP = 0.03
 """Smallest step in u of one number that moves outlines. Over a pixel a classifier's loss is rough: what it does over
 the 2 to 5 % of a range that a search goes at a time has another sign as often as not, and more noise hides it.
@@ -105,8 +107,6 @@ the 2 to 5 % of a range that a search goes at a time has another sign as often a
 SEARCH_SHARE = 0.4
 """Share of the picture that such a step moves the fastest outline over at most: of an endless range, 3 % would move all
 things out of sight."""
-
-
 STORED = ("control", "parameter", "size", "estimator", "valid", "step", "step_reason", "reason")
 """What a run stores of one group of coordinates; see `Group`."""
 CHOSEN = ("estimator", "step", "reason")  # what of it a plan for the same space takes over
@@ -139,9 +139,8 @@ class GradientPlan:
 
     def with_estimator(self, names: Mapping[str, str], reason: str) -> GradientPlan:
         """Return the plan with the estimators of some groups replaced, by `control.parameter`."""
-        return self._changed(
-            lambda group: {"estimator": names[group.name], "reason": reason} if group.name in names else {}
-        )
+        chosen = {name: {"estimator": estimator, "reason": reason} for name, estimator in names.items()}
+        return self._changed(lambda group: chosen.get(group.name, {}))
 
     def with_steps(self, factor: float) -> GradientPlan:
         """Return the plan with every step multiplied by a factor, within `STEP_RANGE`."""
@@ -187,18 +186,10 @@ def first_plan(
     spp: int | None = None,
     across: float = math.inf,
 ) -> GradientPlan:
-    """Return the plan before anything was measured: each group's preferred estimator, or the one forced on it.
-
-    Args:
-        groups: with `valid` filled in; `estimator` is set here.
-        steps: (d,) half-widths of differences in u over which outlines move by a pixel.
-        forced: estimator by "control.parameter", "control", or "*" for all where it is valid.
-        spp: samples a pixel of differences.
-        across: longer side of the picture in pixels.
-
-    Raises:
-        InputError: an estimator is unknown, or not valid where it was forced by name.
-    """
+    """Return the plan before anything was measured: each group's preferred estimator, or the one `forced` on it by
+    "control.parameter", "control", or "*" for all where it is valid; with (d,) half-widths of differences in u over
+    which outlines move by a pixel, samples a pixel of differences, and pixels of the longer side of the picture. Raises
+    InputError: an estimator is unknown, or not valid where it was forced by name."""
     forced = dict(forced or {})
     names = {key for group in groups for key in (group.name, group.control)}
     for name, estimator in forced.items():

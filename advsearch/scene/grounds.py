@@ -49,16 +49,30 @@ class Photograph:
     Where the photograph shows what is brighter than a white floor in this light, a lamp, a window low down or its
     reflection, the reflectance is above 1. Such texels still look as photographed.
 
-    Args:
-        radiance: (H, W, 3) linear radiance, row 0 straight up.
-        height: of the camera above the ground, object sizes.
-        rotation: of the map about the vertical, degrees.
+    It is made of linear radiance (H, W, 3), row 0 straight up, the camera's height above the ground in object sizes,
+    and the map's rotation about the vertical in degrees.
     """
 
     def __init__(self, radiance: Floats, height: float, rotation: float) -> None:
         self._rows = radiance.shape[0]
         self._first = (self._rows - 1) // 2
-        self.mesh = self._plane(height, math.radians(rotation))
+        # rings around the point below the camera, with the map's own coordinates as texture coordinates
+        radii = np.concatenate([[0.0], np.geomspace(NEAREST, FARTHEST, RINGS)])
+        turns = np.linspace(0.0, 1.0, SECTORS + 1)
+        radius, turn = np.meshgrid(radii, turns, indexing="ij")
+        azimuth = 0.5 * math.pi - 2.0 * math.pi * turn + math.radians(rotation)
+        polar = math.pi - np.arctan(radius)
+        vertices = height * np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), 0.0 * radius], axis=-1)
+        texels = self._rows - self._first
+        row = polar / math.pi * (self._rows - 1) - self._first
+        uvs = np.stack([turn, 1.0 - (row + 0.5) / texels], axis=-1)
+        inner = (np.arange(RINGS)[:, None] * (SECTORS + 1) + np.arange(SECTORS)).ravel()
+        outer = inner + SECTORS + 1
+        further = np.stack([inner, inner + 1, outer + 1], axis=1)[SECTORS:]
+        faces = np.concatenate([np.stack([outer, inner, outer + 1], axis=1), further]).astype(np.uint32)
+        normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1))
+        places, texture = vertices.reshape(-1, 3).astype(np.float32), uvs.reshape(-1, 2).astype(np.float32)
+        self.mesh = Mesh(places, faces, normals, texture)
         self.base = self.reflectance(torch.from_numpy(np.asarray(radiance, dtype=np.float32)))
 
     def reflectance(self, radiance: Tensor) -> Tensor:
@@ -72,29 +86,9 @@ class Photograph:
         arriving = irradiance(radiance)
         return torch.where(arriving > 0.0, lower_half * math.pi / arriving.clamp_min(1e-30), 0.0)
 
-    def _plane(self, height: float, rotation: float) -> Mesh:
-        """Rings around the point below the camera, with the map's own coordinates as texture coordinates."""
-        radii = np.concatenate([[0.0], np.geomspace(NEAREST, FARTHEST, RINGS)])
-        turns = np.linspace(0.0, 1.0, SECTORS + 1)
-        radius, turn = np.meshgrid(radii, turns, indexing="ij")
-        azimuth = 0.5 * math.pi - 2.0 * math.pi * turn + rotation
-        polar = math.pi - np.arctan(radius)
-        vertices = height * np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), 0.0 * radius], axis=-1)
-        texels = self._rows - self._first
-        row = polar / math.pi * (self._rows - 1) - self._first
-        uvs = np.stack([turn, 1.0 - (row + 0.5) / texels], axis=-1)
-        inner = (np.arange(RINGS)[:, None] * (SECTORS + 1) + np.arange(SECTORS)).ravel()
-        outer = inner + SECTORS + 1
-        further = np.stack([inner, inner + 1, outer + 1], axis=1)[SECTORS:]
-        faces = np.concatenate([np.stack([outer, inner, outer + 1], axis=1), further]).astype(np.uint32)
-        normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (vertices.size // 3, 1))
-        places, texture = vertices.reshape(-1, 3).astype(np.float32), uvs.reshape(-1, 2).astype(np.float32)
-        return Mesh(places, faces, normals, texture)
-
 
 @lru_cache(maxsize=4)
 def photograph_of(environment: EnvironmentAsset, height: float, rotation: float) -> Photograph:
-    """Return the floor of an environment; arguments as of `Photograph`."""
     return Photograph(environment.radiance, height, rotation)
 
 
@@ -127,7 +121,11 @@ PLACES: Mapping[str, Callable[..., tuple[MeshPart, ...]]] = {
 
 def on_its_ground(scene: SceneDescription) -> SceneDescription:
     """Return the scene with the road or the place that its environment and its settings ask for, and no other."""
-    kind = _kind(scene)
+    kind, asked = None, scene.values.get("ground.kind")
+    if scene.number("ground.size") > 0.0 and asked is not None:
+        kind = settings.GROUND_KINDS[int(asked)]
+    elif scene.number("ground.size") > 0.0 and scene.given.isdisjoint(settings.TABLE_SETTINGS):
+        kind = None if scene.environment is None else scene.environment.ground
     others = tuple(part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid))
     if kind in settings.PLACES:
         light, dark = scene.environment, kind == settings.LIT_ROOM
@@ -143,13 +141,3 @@ def on_its_ground(scene: SceneDescription) -> SceneDescription:
 
 
 DUSK = 70.0  # illuminance of the open sky at which street lamps are switched on, lux
-
-
-def _kind(scene: SceneDescription) -> str | None:
-    kind = scene.values.get("ground.kind")
-    if scene.number("ground.size") == 0.0:
-        return None
-    if kind is not None:
-        return settings.GROUND_KINDS[int(kind)]
-    described = not scene.given.isdisjoint(settings.TABLE_SETTINGS)
-    return None if scene.environment is None or described else scene.environment.ground

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Doubles, Floats, Ints, Material, Mesh, face_vectors
+from advsearch.scene.assets import Doubles, Floats, Ints, Material, Mesh, face_vectors, pose_of
 from advsearch.scene.grounds import LUMINANCE
 from advsearch.scene.parts import CAMERA, BeamLamp, LampGlass, MeshPart, ScenePart
 from advsearch.scene.settings import LAMPS
@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
 CUT_OFF = -0.57  # degrees above the horizon at which the low beam has half of what it has below
-SIDES, ROWS, COLUMNS = 1.0, 512, 896
-"""Tangent of the table's angle to either side, and its size; up and down it has the same tangent a texel."""
+SIDES, ROWS, COLUMNS = 1.0, 512, 896  # tangent of the table's angle to either side, and its size; texels are square
 GLASS, REAR = 250.0, 10.0  # candela ahead of the glass of one headlamp, and behind that of one tail lamp
 WHITE, RED = (color / (color @ np.array(LUMINANCE)) for color in np.array([[1.0, 0.95, 0.86], [1.0, 0.0, 0.0]]))
 """Linear colours with a luminance of 1."""
@@ -56,8 +55,7 @@ OUT = 0.004  # how far glass stands out from what it lies on, metres
 
 
 def candela(kind: str, h: Doubles, v: Doubles) -> Doubles:
-    """Return the luminous intensity of one headlamp, "low" or "high", at degrees to the side and above the horizon; see
-    above."""
+    """Return the luminous intensity of one headlamp, "low" or "high", at degrees aside and up; see above."""
     below = CUT_OFF - v
     spot = 14500.0 * np.exp(-((h / 5.0) ** 2) / 2.0 - below.clip(0.0) / 1.5)
     flood = 4000.0 * np.exp(-((h / 16.0) ** 2) / 2.0 - below.clip(0.0) / 5.0)
@@ -131,8 +129,7 @@ def _lamps_of(scene: SceneDescription, carrier: str, kind: str, unit: float, wei
             places.append(np.array([high[0] + 5.0 * OUT * step, *(low + high)[1:] / 2.0]))
     red, green, blue = map(float, WHITE / (unit * scene.metres**2))
     for name, place in zip(("left", "right"), places, strict=True):
-        seat = np.eye(4)
-        seat[:3] = np.stack([(0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), place], axis=1)
+        seat = pose_of([(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)], place)
         yield BeamLamp(f"{carrier}-{name}-beam", carrier, seat, table(kind), (red, green, blue), weight)
 
 

@@ -5,9 +5,7 @@ The files travel inside the package (`advsearch.bundled`, its `data` folder) and
 
 from __future__ import annotations
 
-import io
 import json
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -21,8 +19,9 @@ from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.files import MESHES, either
 from advsearch.scene.assets import Bools, EnvironmentAsset, Floats, Material, Mesh, ObjectAsset
 from advsearch.scene.importing.files import read_bytes, safe_name
-from advsearch.scene.importing.hdr import Plane, Planes, linear, read_exr, read_radiance
+from advsearch.scene.importing.hdr import Plane, linear, read_exr, read_radiance
 from advsearch.scene.importing.pictures import area_average, banded_average
+from advsearch.scene.importing.ply import read_elements
 from advsearch.scene.parts import BASE_COLOR
 from advsearch.scene.raster import rasterised
 
@@ -53,12 +52,6 @@ if TYPE_CHECKING:
 
 BUNDLED_OBJECT = "bundled object"  # source of an object that is bundled, or another member of its family
 BUNDLED_ENVIRONMENT = "bundled environment"  # source of an environment that is bundled
-_PLY = (
-    rb"ply\nformat binary_little_endian 1\.0\nelement vertex (\d+)\n"
-    + b"".join(rb"property float %s\n" % name.encode() for name in ("x", "y", "z", "nx", "ny", "nz", "s", "t"))
-    + rb"element face (\d+)\nproperty list uchar uint vertex_indices\n"
-)
-"""The header of a bundled mesh."""
 MAP_HINT = "A path to an .hdr or .exr file works too."
 OBJECT_HINT = f"A path to a file that ends in {either(MESHES)} works too."
 
@@ -68,13 +61,11 @@ def _data() -> Traversable:
 
 
 def list_objects() -> tuple[str, ...]:
-    """Return the names of the bundled objects, sorted."""
     return tuple(sorted(p.name for p in (_data() / "objects").iterdir() if (p / "mesh.ply").is_file()))
 
 
 def list_environments(split: str | None = None) -> tuple[str, ...]:
-    """Return the names of the bundled environments, sorted: of the half "train" or "heldout", of "street" or of other
-    places ("place"); None for all."""
+    """Return the names of bundled environments, sorted; of the half "train" or "heldout", "street" or "place"."""
     facts = _environments().items()
     return tuple(sorted(name for name, fact in facts if split is None or fact["split"] == split))
 
@@ -99,7 +90,13 @@ def load_object(name: str) -> ObjectAsset:
         runs = facts.get("faces", ())  # how many faces in a row have which material
         names = np.repeat([name for name, _ in runs], [count for _, count in runs])
         materials = {str(name): np.nonzero(names == name)[0] for name in dict.fromkeys(names)}
-        mesh = replace(_mesh((folder / "mesh.ply").read_bytes()), materials=materials)
+        elements, _ = read_elements(Path(name), (folder / "mesh.ply").read_bytes())
+        vertex, faces = elements["vertex"].scalars, elements["face"].listed["vertex_indices"].values
+        places, normals, uvs = (
+            np.stack([vertex[number] for number in numbers], axis=1).astype(np.float32)
+            for numbers in (("x", "y", "z"), ("nx", "ny", "nz"), ("s", "t"))
+        )
+        mesh = Mesh(places, faces.reshape(-1, 3).astype(np.uint32), normals, uvs, materials=materials)
         if (folder / "body.npz").is_file():
             from advsearch.scene.people import Person, body_data  # torch takes seconds, and most have no body
 
@@ -118,56 +115,30 @@ def load_object(name: str) -> ObjectAsset:
             finishes=finishes,
             metres=facts["metres"],
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, FileFormatError) as error:
         raise FileFormatError(f"bundled object {name!r} cannot be read ({error}); reinstall advsearch") from error
 
 
 def load_environment(name: str) -> EnvironmentAsset:
-    """Return a bundled environment. Raises UnknownNameError: there is no such environment. Raises FileFormatError: the
-    installation is damaged."""
+    """Return a bundled environment. Raises UnknownNameError; FileFormatError: the installation is damaged."""
     known = list_environments()
     if name not in known:
         raise UnknownNameError("environment", name, known, MAP_HINT)
     facts = _environments()[name]
     try:
-        import OpenEXR  # most scenes need no such file
-
         content = (_data() / "environments" / f"{facts.get('map', name)}.exr").read_bytes()
-        with OpenEXR.File(io.BytesIO(content)) as file:
-            radiance: Floats = np.ascontiguousarray(file.channels()["RGB"].pixels[..., :3], dtype=np.float32)
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        radiance: Floats = np.stack(read_exr(Path(name), content)[0], axis=2).astype(np.float32)
+    except (OSError, FileFormatError) as error:
         raise FileFormatError(f"bundled environment {name!r} cannot be read ({error}); reinstall advsearch") from error
-    return EnvironmentAsset(
-        name, radiance, source=BUNDLED_ENVIRONMENT, ground=facts.get("ground"), candelas=facts.get("candelas")
-    )
-
-
-def _mesh(content: bytes) -> Mesh:
-    """Decode a binary PLY as `scenes/files.py` writes it: vertices, normals and texture coordinates, then triangles.
-    Raises ValueError: it is another PLY."""
-    header, _, body = content.partition(b"end_header\n")
-    counts = re.fullmatch(_PLY, header)
-    if counts is None:
-        raise ValueError("mesh.ply has another header than the scripts in scenes/ write")
-    vertices = np.frombuffer(body, "<f4", 8 * int(counts[1])).reshape(-1, 8).astype(np.float32)
-    corners = np.dtype([("count", "u1"), ("vertices", "<u4", 3)])
-    faces = np.frombuffer(body, corners, int(counts[2]), offset=4 * vertices.size)
-    return Mesh(
-        vertices=np.ascontiguousarray(vertices[:, :3]),
-        faces=faces["vertices"].astype(np.uint32),
-        normals=np.ascontiguousarray(vertices[:, 3:6]),
-        uvs=np.ascontiguousarray(vertices[:, 6:]),
-    )
+    ground, candelas = facts.get("ground"), facts.get("candelas")
+    return EnvironmentAsset(name, radiance, source=BUNDLED_ENVIRONMENT, ground=ground, candelas=candelas)
 
 
 # ---- Environments from pictures: ``--environment path.hdr|.exr``, equirectangular maps in linear radiance -----------
 
 SUFFIXES = (".hdr", ".exr")  # the pictures that can be imported
-
 LARGEST = (512, 1024)  # rows and columns of the largest environment kept; larger ones are averaged down
-
-SMALLEST = (4, 8)
-"""Rows and columns that a smaller environment is brought up to by repeating its texels; renderers need a few."""
+SMALLEST = (4, 8)  # rows and columns that a smaller one is brought up to by repeating its texels; renderers need a few
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,14 +152,26 @@ class LightPicture:
 
 
 def read_light(path: Path, what: str = "environment") -> LightPicture:
-    """Read an ``.hdr`` or ``.exr`` picture of any shape. Raises FileFormatError, InputError: as for
-    `import_environment`."""
+    """Read an ``.hdr`` or ``.exr`` picture of any shape; errors as for `import_environment`."""
     data = read_bytes(path, what, SUFFIXES)
     if path.suffix.lower() == ".hdr":
         pixels, scale, notes = read_radiance(path, data)
         return LightPicture(pixels.shape[:2], lambda top, end: linear(pixels[top:end]) * scale, tuple(notes))
     planes, notes = read_exr(path, data)
-    _check_values(path, planes)
+    kinds: tuple[tuple[str, Callable[[Plane], Bools], str], ...] = (
+        ("NaN", np.isnan, "paint them over"),
+        ("infinite", np.isinf, "clamp them, or save the map in 32-bit floats if half floats overflowed"),
+        ("negative", lambda plane: plane < 0.0, "clamp them to 0"),
+    )
+    for kind, bad, remedy in kinds:
+        texels = bad(planes[0]) | bad(planes[1]) | bad(planes[2])
+        if texels.any():
+            row, column = np.unravel_index(int(texels.argmax()), texels.shape)
+            value = ", ".join(f"{float(plane[row, column]):.4g}" for plane in planes)
+            raise InputError(
+                f"{path}: expected finite radiance of at least 0, got {int(texels.sum())} of {texels.size} texels"
+                f" {kind} (the first in row {row}, column {column}: {value}); {remedy}"
+            )
 
     def stacked(top: int, end: int) -> Floats:
         return np.stack([plane[top:end] for plane in planes], axis=2).astype(np.float32)
@@ -215,23 +198,6 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
     if not radiance.any():
         notes.append(f"{file.name}: the environment is black everywhere; it lights nothing")
     return EnvironmentAsset(safe_name(file), radiance, source=str(file), warnings=tuple(notes), photographed=True)
-
-
-def _check_values(file: Path, planes: Planes) -> None:
-    kinds: tuple[tuple[str, Callable[[Plane], Bools], str], ...] = (
-        ("NaN", np.isnan, "paint them over"),
-        ("infinite", np.isinf, "clamp them, or save the map in 32-bit floats if half floats overflowed"),
-        ("negative", lambda plane: plane < 0.0, "clamp them to 0"),
-    )
-    for kind, bad, remedy in kinds:
-        texels = bad(planes[0]) | bad(planes[1]) | bad(planes[2])
-        if texels.any():
-            row, column = np.unravel_index(int(texels.argmax()), texels.shape)
-            value = ", ".join(f"{float(plane[row, column]):.4g}" for plane in planes)
-            raise InputError(
-                f"{file}: expected finite radiance of at least 0, got {int(texels.sum())} of {texels.size} texels"
-                f" {kind} (the first in row {row}, column {column}: {value}); {remedy}"
-            )
 
 
 def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:

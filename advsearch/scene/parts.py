@@ -14,7 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles, Floats, Ints, Material, Shape
+from advsearch.scene.assets import Doubles, Floats, Ints, Material, Shape, pose_of
 
 Triple = tuple[float, float, float]
 BASE_COLOR = "base color"  # the type that stands for the texture in a surface in Mitsuba's words
@@ -111,12 +111,9 @@ class SpotLamp(_Point):
         ahead = np.array(self.direction) if any(self.direction) else np.array([0.0, 0.0, -1.0])
         aside = np.cross(np.eye(3)[np.abs(ahead).argmin()], ahead)
         aside /= np.linalg.norm(aside)
-        matrix = np.eye(4)
-        matrix[:3] = np.stack([aside, np.cross(ahead, aside), ahead, np.array(self.position)], axis=1)
-        return matrix
+        return pose_of(np.stack([aside, np.cross(ahead, aside), ahead], axis=1), self.position)
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
-        """As of a point, within its cone."""
         way, faced = super().lighting(place)
         cutoff, beam = self.cone
         along = -way @ self.to_world[:3, 2] / max(float(np.linalg.norm(way)), 1e-12)
@@ -163,7 +160,6 @@ class BeamLamp(ScenePart):
     dark: ClassVar[bool] = False
 
     def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
-        """As of a point, by the table."""
         way = self.to_world[:3, 3] - place
         aside, up, ahead = -way @ self.to_world[:3, :3]
         height, width = self.table.shape
@@ -189,7 +185,6 @@ class ProjectorPart(ScenePart):
 
     @property
     def aspect(self) -> float:
-        """Width over height."""
         return self.sides[1] / self.sides[0]
 
     @property
@@ -238,8 +233,7 @@ class PluginNumber:
 
 @dataclass(frozen=True, eq=False)
 class PluginNumbers(ScenePart):
-    """Numbers and colours of what is in the scene already. Takes the inputs of its numbers that begin with `NAME.`,
-    (1,) or (3,) each."""
+    """Numbers and colours of what is in the scene already. Takes their inputs, which begin with `NAME.`."""
 
     numbers: tuple[PluginNumber, ...] = ()  # some of the scene
 

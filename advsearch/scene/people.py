@@ -106,7 +106,6 @@ class Person:
         self.size = float((self.standing.amax(dim=0) - self.standing.amin(dim=0)).max())
 
     def offsets(self, values: Mapping[str, Tensor], clip: str | None = None) -> Tensor:
-        """Return how far each vertex (V, 3) goes from the defaults, in sizes; values as `posed` has them."""
         posed = self.posed(values)
         return (posed - self.standing.to(posed.device)) / self.size
 
@@ -128,7 +127,6 @@ class Person:
         return (factor * (posed - floor)).index_select(0, self._on("index", device))
 
     def measured(self, values: Mapping[str, Tensor], clip: str | None = None) -> Mapping[str, Value]:
-        """Return its mass without clothes, between those of MakeHuman's extremes."""
         mixed, factor = self._phenotype(self._numbers(values))
         return {"mass": {"value": float((mixed * self._on("mass", mixed.device)).sum() * factor**3), "unit": "kg"}}
 
@@ -152,32 +150,26 @@ class Person:
 
     def _skeleton(self, joints: Tensor, angle: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Turn (J, 3, 3) and shift (J, 3) of each bone: p goes to `turn @ p + shift`."""
-        straight, own = self._straightened(joints), turned(angle)
+        straight, own = dict[str, Tensor](), turned(angle)
+        for side, sign in (("l", 1.0), ("r", -1.0)):  # each bone that has a direction where all angles are 0
+            for bone, (end, (x, y, z)) in STRAIGHT.items():
+                begin, stop = (joints[self._bones.index(f"{name}_{side}")] for name in (bone, end))
+                straight[f"{bone}_{side}"] = least_turn(stop - begin, joints.new_tensor([x, sign * y, z]))
+            straight[f"hand_{side}"] = about("z", joints.new_tensor(sign * 60.0)) @ straight[f"lowerarm_{side}"]
         same = torch.eye(3, device=joints.device, dtype=joints.dtype)
-        about, turns, places = list[Tensor](), list[Tensor](), list[Tensor]()
+        carried, turns, places = list[Tensor](), list[Tensor](), list[Tensor]()
         for number, (bone, parent) in enumerate(zip(self._bones, self._parents, strict=True)):
             turn = own.get(bone, same)
-            about.append(turn if parent < 0 else about[parent] @ turn)
-            turns.append(about[-1] @ straight.get(bone, same))
+            carried.append(turn if parent < 0 else carried[parent] @ turn)
+            turns.append(carried[-1] @ straight.get(bone, same))
             reach = joints[number] - joints[parent]
             places.append(joints[number] if parent < 0 else places[parent] + turns[parent] @ reach)
         stacked = torch.stack(turns)
         return stacked, torch.stack(places) - torch.einsum("jik,jk->ji", stacked, joints)
 
-    def _straightened(self, joints: Tensor) -> dict[str, Tensor]:
-        """The turn of each bone that has a direction where all angles are 0."""
-        turns = {}
-        for side, sign in (("l", 1.0), ("r", -1.0)):
-            for bone, (end, (x, y, z)) in STRAIGHT.items():
-                begin, stop = (joints[self._bones.index(f"{name}_{side}")] for name in (bone, end))
-                turns[f"{bone}_{side}"] = least_turn(stop - begin, joints.new_tensor([x, sign * y, z]))
-            turns[f"hand_{side}"] = about("z", joints.new_tensor(sign * 60.0)) @ turns[f"lowerarm_{side}"]
-        return turns
-
 
 @lru_cache(maxsize=1)
 def body_data() -> Mapping[str, np.ndarray]:
-    """Return the arrays of the bundled body."""
     content = (resources.files("advsearch.bundled") / "data/objects/person/body.npz").read_bytes()
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         return dict(file)
@@ -205,9 +197,8 @@ def walked(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
                 swing = swing + 2.0 * (float(wave.real) * torch.cos(at) - float(wave.imag) * torch.sin(at))
             angle[f"{side}_{joint}"] = angle[f"{side}_{joint}"] + stride * swing
     angle["spine_turn"] = angle["spine_turn"] + stride * 5.0 * torch.cos(phase)
-    limits = {
-        angle.name: (angle.low, angle.high) for angle in PARAMETERS if angle.unit == "degrees" and not angle.periodic
-    }
+    joints = (parameter for parameter in PARAMETERS if parameter.unit == "degrees" and not parameter.periodic)
+    limits = {joint.name: (joint.low, joint.high) for joint in joints}
     return {name: value.clamp(*limits[name]) if name in limits else value for name, value in angle.items()}
 
 

@@ -13,8 +13,7 @@ from advsearch.scene.renderer import Renderer
 
 NOISE = "noise is part of the picture without the denoiser"
 """A reason against predictions that stands alone: with the denoiser, the same pictures could be predicted."""
-BETWEEN = (0.02, 0.29, 0.61, 0.97)
-"""Places in the range of a continuous parameter at which its effect on the inputs is looked up."""
+BETWEEN = (0.02, 0.29, 0.61, 0.97)  # places in the range of a parameter at which its effect on the inputs is looked up
 MOST_BYTES = 2**30  # memory of what one predictor keeps, times `ADVSEARCH_LIMITS`
 
 
@@ -38,7 +37,6 @@ class Predictor(ABC):
         return self.renderer(u)
 
     def pictures(self, us: Sequence[Tensor]) -> Sequence[Tensor]:
-        """Return the pictures of several configurations."""
         return [self(u) for u in us]
 
     @abstractmethod

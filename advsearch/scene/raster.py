@@ -28,15 +28,10 @@ MISS = 1e-4  # pixels by which a centre may miss a triangle and still be looked 
 def pixels_in(
     corners: Doubles, shape: tuple[int, int], tolerance: float = TOLERANCE
 ) -> tuple[Ints, Ints, Ints, Doubles]:
-    """List the pixels of a raster (height, width) whose centres lie in each of many triangles, triangle by triangle.
-
-    Args:
-        corners: (F, 3, 2) column and row; integers are pixel centres. Triangles without area cover nothing.
-        tolerance: barycentric weight by which a centre may miss its triangle.
-
-    Returns:
-        For every such pixel: its triangle, row, column (N,) and the corners' barycentric weights (N, 3).
-    """
+    """List the pixels of a raster (height, width) whose centres lie in each of many triangles, or miss it by a
+    barycentric weight of at most `tolerance`, triangle by triangle: for every such pixel its triangle, row and column
+    (N,), and the corners' barycentric weights (N, 3). Corners (F, 3, 2) are columns and rows, integers at pixel
+    centres; triangles without area cover nothing."""
     face, row, column = pixels_near(corners, shape, 10.0 * MISS)
     weights = weights_at(corners[face], row, column)
     inside = (weights >= -tolerance).all(axis=1)
@@ -44,9 +39,8 @@ def pixels_in(
 
 
 def pixels_near(corners: Doubles, shape: tuple[int, int], miss: float = MISS) -> tuple[Ints, Ints, Ints]:
-    """List the pixels whose centres lie in each of many triangles, or miss it by so many pixels along their row or
-    column; also in flat ones. Arguments as of `pixels_in`; returns for every such pixel its triangle, row and column
-    (N,)."""
+    """List the pixels whose centres lie in each of many triangles, also flat ones, or miss it by so many pixels along
+    their row or column; arguments as of `pixels_in`, returns triangle, row and column (N,)."""
     face, row = _ranges(corners[..., 1].min(axis=1), corners[..., 1].max(axis=1), shape[0], miss)
     span, column = _ranges(*_crossing(corners[face], row, miss), shape[1], miss)
     return face[span], row[span], column
@@ -113,8 +107,7 @@ def _crossing(corners: Doubles, row: Ints, miss: float) -> tuple[Doubles, Double
     return np.where(empty, 0.0, left), np.where(empty, -1.0, right)
 
 
-BORDER = 2.0
-"""Texels around a chart that still belong to it: a bilinear lookup inside a chart reaches one texel beyond it."""
+BORDER = 2.0  # texels around a chart that belong to it: a bilinear lookup inside reaches one texel beyond it
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,8 +158,7 @@ def texels_of_faces(mesh: Mesh, faces: Ints, shape: tuple[int, int]) -> tuple[Bo
 
 def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     """Find the face and the barycentric weights behind every texel centre of a texture, square where its resolution is
-    one number. Where charts overlap, one of their faces wins. Raises InputError: the texture coordinates cover no
-    texel."""
+    one number. Where charts overlap, one of their faces wins. Raises InputError: they cover no texel."""
     shape = (resolution, resolution) if isinstance(resolution, int) else resolution
     corners = _in_texels(mesh, shape)
     face, row, column = pixels_near(corners, shape)

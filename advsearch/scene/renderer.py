@@ -31,29 +31,15 @@ from advsearch.scene.assembly import ON_PICTURE, Motion, central
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import ImageFormation, Later, Moment, levels_of
 from advsearch.scene.geometry import camera_to_world, middle
-from advsearch.scene.gradients import (
-    BY_ADJOINT,
-    BY_DIFFERENCES,
-    DEFAULT_PIXELS,
-    DEFAULT_STEP,
-    STEP_RANGE,
-    TURN_STEP,
-    Group,
-    first_order,
-    first_plan,
-)
+from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_order, first_plan, steps_for
 from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.rig import Mount
 from advsearch.scene.surfaces import Surfaces
 
 MAX_SPP = 65536
-
 Configuration = Tensor | npt.NDArray[np.floating[Any]] | Sequence[float]  # a point of the unit box
-
-Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
-"""From scene inputs, seed and samples a pixel to linear radiance (H, W, 3)."""
-
+Source = Callable[[Mapping[str, Tensor], int, int], Tensor]  # from inputs, seed and spp to radiance (H, W, 3)
 Predict = Callable[[Mapping[str, Tensor]], Tensor]
 """From scene inputs to linear radiance (H, W, 3), or (H, W, 4) with coverage where there is a backdrop; differentiable.
 """
@@ -84,8 +70,7 @@ class InputSpace(Later, Protocol):
 
 
 MOST_MEASURED = 64  # coordinates of a group up to which it is measured how far they move outlines
-SMALL_PART = 0.0625
-"""Part of noise that is taken through the tone curve, which is straight over so little; see `Renderer.halves`."""
+SMALL_PART = 0.0625  # of noise, over which the tone curve is straight; see `Renderer.halves`
 
 
 class Renderer:
@@ -93,7 +78,6 @@ class Renderer:
 
     Attributes:
         start: (d,) float32 in [0, 1], the configuration that leaves the scene as it is.
-        formation: how radiance becomes the picture.
         plan: how each coordinate is differentiated; may be replaced.
         routes: which scene inputs each group of coordinates reaches, by `control.parameter`.
         renders: number of primal renders so far, those of differences included.
@@ -162,15 +146,10 @@ class Renderer:
         predict: Predict | None = None,
         **formation: Any,
     ) -> Renderer:
-        """Return a renderer of the same space that counts on from this one's counters, by itself.
-
-        Args:
-            scene: in place of this one's.
-            source: another program, which renders and denoises.
-            predict: what predicts radiance (`scene.predictor`): seed and samples of a call mean nothing then, and every
-                derivative runs back through scene inputs, whatever the plan says.
-            formation: other fields of the image formation.
-        """
+        """Return a renderer of the same space that counts on from this one's counters, by itself: with another scene,
+        other fields of the image formation, a `source` (another program, which renders and denoises), or what predicts
+        radiance (`scene.predictor`): seed and samples of a call mean nothing then, and every derivative runs back
+        through scene inputs, whatever the plan says."""
         other = copy.copy(self)
         other.formation = replace(self.formation, **formation)
         other.scene, other._source = scene or self.scene, source or self._source
@@ -241,8 +220,7 @@ class Renderer:
 
     def surfaces(self, u: Configuration, fineness: int = 1, camera: int = 0) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel of u (d,), or of each of `fineness` by
-        `fineness` parts of it; as of `mask`. The cameras of a rig have numbers, of which 0 is the first, or the only
-        one."""
+        `fineness` parts of it; as of `mask`. The cameras of a rig have numbers from 0."""
         u, _ = self._given(u, 1)
         with torch.no_grad():
             rig = self.scene.made[0].rig
@@ -253,18 +231,10 @@ class Renderer:
     def gradient(
         self, loss: Callable[[Tensor], Tensor], u: Tensor, seed: int, spp: int, *, free: bool = False
     ) -> tuple[Tensor, Tensor]:
-        """Return the loss of a picture and its derivative with respect to u, by the plan.
-
-        Unlike autograd through a call, this gives coordinates with the estimator "secant" differences of the loss.
-
-        Args:
-            loss: from (H, W, 3) sRGB to a number.
-            u, seed, spp: (d,) in [0, 1]; as in a call.
-            free: leave out what takes primal renders of its own; zero for coordinates that use differences.
-
-        Returns:
-            The loss, without graph, and (d,) float32.
-        """
+        """Return the loss, from (H, W, 3) sRGB to a number, of the picture of u (d,), without graph, and its derivative
+        (d,) float32 by the plan; u, seed and spp as in a call. Unlike autograd through a call, this gives coordinates
+        with the estimator "secant" differences of the loss; `free` leaves out what takes primal renders of its own,
+        with zero for coordinates that use differences."""
         self._left_out = BY_DIFFERENCES if free else frozenset({"secant"})
         try:
             with torch.inference_mode(False), torch.enable_grad():
@@ -306,24 +276,21 @@ class Renderer:
             return u, u.detach() + mask * (u - u.detach())
 
     def _picture(self, u: Tensor, seed: int, spp: int, *, display: bool = True) -> Tensor:
-        """The picture of u, or else the radiance that is to be displayed; of a rig those of its cameras side by side,
-        (H, K W, 3)."""
-        rig = self.scene.made[0].rig
-        if not rig:
-            return self._view(None, u, seed, spp, display=display)
-        renders, seeds_of = self.renders, [seed, *(seeds.stream(seed, "camera", k) for k in range(1, len(rig)))]
-        views = [self._view(mount, u, noise, spp, display=display) for mount, noise in zip(rig, seeds_of, strict=True)]
+        """The picture of u, or its radiance before display; of a rig its cameras' side by side, (H, K W, 3)."""
+        renders, views = self.renders, list[Tensor]()
+        for number, mount in enumerate(self.scene.made[0].rig or (None,)):
+            noise = seeds.stream(seed, "camera", number) if number else seed
+            inputs = self._seen(mount, u)
+            hide = "backdrop.color" in inputs
+            if self.moments:
+                rendered = self._exposed(mount, u, noise, spp, hide)
+            else:
+                rendered = self.rendered(_traced(inputs), noise, spp, hide)
+            views.append(self.finished(rendered, inputs, u, display=display))
+        if len(views) == 1:
+            return views[0]
         self.renders = renders + 1  # one configuration, as budgets count it
         return torch.cat(views, dim=1)
-
-    def _view(self, mount: Mount | None, u: Tensor, seed: int, spp: int, *, display: bool) -> Tensor:
-        inputs = self._seen(mount, u)
-        hide = "backdrop.color" in inputs
-        if self.moments:
-            rendered = self._exposed(mount, u, seed, spp, hide)
-        else:
-            rendered = self.rendered(_traced(inputs), seed, spp, hide)
-        return self.finished(rendered, inputs, u, display=display)
 
     def _seen(self, mount: Mount | None, u: Tensor, then: Later | None = None) -> dict[str, Tensor]:
         """Scene inputs of u as a camera of a rig, or the only one, sees them: when it takes its picture, or `then`."""
@@ -407,8 +374,7 @@ class Renderer:
         moving = [number for group in few for number in range(group.begin, group.begin + group.size)]
         if motion is not None and moving:
             speeds = motion.speeds(lambda u: self.scene.assembly(self.space.inputs(u)), self.start, moving)
-        moving_a_pixel = DEFAULT_PIXELS / speeds.clamp_min(1e-3)
-        steps = torch.where(speeds > 1e-3, moving_a_pixel, torch.full_like(speeds, DEFAULT_STEP)).clamp(*STEP_RANGE)
+        steps = steps_for(speeds)
         for group in groups:
             if group.periodic and not bool(speeds[group.coordinates].any()):
                 steps[group.coordinates] = TURN_STEP

@@ -18,10 +18,11 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import FileFormatError
-from advsearch.files import read_text
-from advsearch.scene.assets import Doubles
-from advsearch.scene.camera_files import LARGEST_JSON, OF_A_FRAME, camera_text, read_camera, read_json
+from advsearch.files import parse_json, parsed, present_text, read_text
+from advsearch.scene.assets import Doubles, pose_of
+from advsearch.scene.camera_files import LARGEST_JSON, OF_A_FRAME, read_camera
 from advsearch.scene.camera_model import CameraModel
+from advsearch.scene.geometry import rotation
 from advsearch.scene.skeleton import entries_of_turn
 from advsearch.yaml_text import LARGEST, parse_yaml
 
@@ -29,8 +30,7 @@ MOST_CAMERAS = 32
 FARTHEST = 1e4  # metres, or object sizes, that a camera may be from the first
 KEYS = ("name", "place", "turn", "around", "fov", "later")
 LATEST = 60.0  # seconds after the first picture
-AXES = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""From x to the right, y down, z ahead to Mitsuba's: x to the left, y up, z ahead."""
+AXES = np.diag([-1.0, -1.0, 1.0, 1.0])  # from x to the right, y down, z ahead to Mitsuba's: left, up, ahead
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From nerfstudio's axes of a camera, x to the right, y up, z back, to x to the right, y down, z ahead."""
 COLMAPS = "images.txt"
@@ -50,19 +50,12 @@ class Mount:
     later: float = 0.0  # seconds after the first that it takes its picture, along the path of a control
 
     def seen(self, inputs: Mapping[str, Tensor], first: Tensor, middle: Tensor, metres: float) -> dict[str, Tensor]:
-        """Return scene inputs as this camera sees them.
-
-        Args:
-            inputs: as the first camera does.
-            first: (4, 4) pose of that where the inputs have none.
-            middle: (3,) of the object, as the scene was described.
-            metres: that a unit of the scene is long; 1 where that is not known.
-        """
+        """Return scene inputs as this camera sees them, of those that the `first` camera sees, whose pose is (4, 4)
+        where they have none, around the middle (3,) of the object; a unit of the scene is so many metres long."""
         pose = torch.from_numpy(AXES @ self.pose @ AXES).float()
         pose[:3, 3] /= metres
-        angle = math.radians(self.around)
         turn = torch.eye(4)
-        turn[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        turn[:3, :3] = torch.from_numpy(rotation(self.around, 0.0, 0.0))
         turn[:3, 3] = middle - turn[:3, :3] @ middle
         seen = {**inputs, "camera.to_world": turn @ inputs.get("camera.to_world", first) @ pose}
         if self.fov is not None:
@@ -113,10 +106,9 @@ def _of_entry(spec: str, number: int, given: Any) -> Mount:
     name = given.get("name", f"camera {number + 1}")
     if not isinstance(name, str) or not 0 < len(name) <= 40:
         raise FileFormatError(f"{where}: name: expected a short text, got {str(name)[:80]!r}")
-    yaw, pitch, roll = map(math.radians, _numbers(where, "turn", given.get("turn", [0.0] * 3), 3, 3600.0))
-    pose = np.eye(4)
-    pose[:3, :3] = _about(1, yaw) @ _about(0, pitch) @ _about(2, roll)
-    pose[:3, 3] = _numbers(where, "place", given.get("place", [0.0] * 3), 3, FARTHEST)
+    yaw, pitch, roll = _numbers(where, "turn", given.get("turn", [0.0] * 3), 3, 3600.0)
+    turn = rotation(0.0, yaw, 0.0) @ rotation(0.0, 0.0, pitch) @ rotation(roll, 0.0, 0.0)  # about y, x and z
+    pose = pose_of(turn, _numbers(where, "place", given.get("place", [0.0] * 3), 3, FARTHEST))
     (around,) = _numbers(where, "around", [given.get("around", 0.0)], 1, 3600.0)
     fov = _numbers(where, "fov", [given["fov"]], 1, 170.0)[0] if "fov" in given else None
     if fov is not None and fov < 1.0:
@@ -134,14 +126,6 @@ def _numbers(where: str, key: str, given: Any, count: int, most: float) -> list[
     return list(map(float, given))
 
 
-def _about(axis: int, angle: float) -> Doubles:
-    first, second = (axis + 1) % 3, (axis + 2) % 3
-    turn = np.eye(3)
-    turn[[first, second], [first, second]] = math.cos(angle)
-    turn[first, second], turn[second, first] = -math.sin(angle), math.sin(angle)
-    return turn
-
-
 def _of_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
     cameras = {name: camera for name, camera in data.items() if isinstance(camera, dict) and "intrinsics" in camera}
     names = sorted(cameras, key=lambda name: (len(str(name)), str(name)))
@@ -154,7 +138,7 @@ def _of_camchain(spec: str, data: Mapping[str, Any]) -> tuple[Mount, ...]:
 
 
 def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
-    data = read_json(path, camera_text(path, LARGEST_JSON))
+    data = parsed(path, present_text(path, "a camera file", LARGEST_JSON), "JSON", parse_json)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
         raise FileFormatError(f"{path}: expected `frames`, a list with a camera each, as nerfstudio writes it")
@@ -174,7 +158,7 @@ def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
 def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
     """COLMAP's images.txt: in every second line a rotation (quaternion, real part first) and a shift from the world to
     the camera, whose model is in the cameras.txt beside it."""
-    text = camera_text(path, MOST_BYTES, "COLMAP's images")
+    text = present_text(path, "COLMAP's images", MOST_BYTES)
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     rows = {words[0]: words for line in lines[::2] if (words := line.split(maxsplit=9))}
     if not rows:
@@ -197,10 +181,8 @@ def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:
         w, x, y, z, *shift = _numbers(where, "pose", numbers, 7, FARTHEST)
         if not 0.99 < (length := math.sqrt(w * w + x * x + y * y + z * z)) < 1.01:
             raise FileFormatError(f"{where}: expected a quaternion of length 1, got one of {length:.3g}")
-        seen = np.eye(4)
-        seen[:3, :3] = np.reshape(entries_of_turn(x / length, y / length, z / length, w / length), (3, 3))
-        seen[:3, 3] = shift
-        poses.append(np.asarray(np.linalg.inv(seen), np.float64))
+        turn = np.reshape(entries_of_turn(x / length, y / length, z / length, w / length), (3, 3))
+        poses.append(np.asarray(np.linalg.inv(pose_of(turn, shift)), np.float64))
         models.append(read_camera(f"{Path(path).with_name('cameras.txt')}#{words[8]}"))
     return _mounted(path, names, poses, models)
 

@@ -29,8 +29,7 @@ WEIGHT = "weight"
 TIME = moving(
     GEOMETRIC, "time", "1", 0.0, 1.0, 0.0, "Of the clip of a rigged file: 0 is its beginning, 1 its end.", (0.0, 1.0)
 )
-NEARLY_ONE = 1.0 - 1e-9
-"""Cosine of the angle between two rotations beyond which there is nothing to choose between arc and chord."""
+NEARLY_ONE = 1.0 - 1e-9  # cosine of the angle between rotations beyond which arc and chord are the same
 
 
 def part_of_a_rig(name: str) -> Parameter | None:
@@ -44,23 +43,14 @@ def part_of_a_rig(name: str) -> Parameter | None:
 
 
 class SkeletonRig:
-    """What moves the mesh of a glTF file.
-
-    Args:
-        parts: all that the mesh is made of, in order.
-        vertices: (V,) for each of the mesh's, its number among those of all parts one after the other.
-        to_mesh: (3, 3) from the file's axes and unit to the mesh's.
-    """
+    """What moves the mesh of a glTF file, which is made of some parts: each of its `vertices` (V,) is the number of one
+    among those of all parts one after the other, and (3, 3) `to_mesh` leads from the file's axes and unit to its."""
 
     def __init__(self, parts: Sequence[Movable], vertices: Ints, to_mesh: Doubles) -> None:
-        self.skeleton = parts[0].skeleton
+        self.skeleton, parents = parts[0].skeleton, parts[0].skeleton.parents
         self._to_mesh = torch.from_numpy(to_mesh)
         self._upright = torch.from_numpy(to_mesh / np.cbrt(np.linalg.det(to_mesh)))
-        self._gather(parts, vertices)
-        self._order()
-        self._rest = self.posed({})
-
-    def _gather(self, parts: Sequence[Movable], vertices: Ints) -> None:
+        # the parts one after the other, and what the mesh has of them
         widest = max(part.joints.shape[1] for part in parts)
         counts = [len(part.vertices) for part in parts]
         starts, slots = np.cumsum([0, *counts]), np.cumsum([0, *(len(part.nodes) for part in parts)])
@@ -85,27 +75,24 @@ class SkeletonRig:
                 moves = torch.from_numpy(target.moves[rows[hit]])
                 rest = float(part.rest[number])
                 self._targets.append((target.name, part.node, number, rest, torch.from_numpy(mine[hit]), moves))
-
-    def _order(self) -> None:
-        """Sort the nodes by their depth, so that all of one depth are placed at once."""
-        skeleton = self.skeleton
-        level, self._levels = np.flatnonzero(skeleton.parents < 0), list[tuple[Tensor, Tensor]]()
-        row = np.zeros(len(skeleton.parents), np.int64)
+        # the nodes by their depth, so that all of one depth are placed at once
+        level, self._levels = np.flatnonzero(parents < 0), list[tuple[Tensor, Tensor]]()
+        row = np.zeros(len(parents), np.int64)
         while len(level):
-            self._levels.append((torch.from_numpy(level), torch.from_numpy(row[skeleton.parents[level]])))
+            self._levels.append((torch.from_numpy(level), torch.from_numpy(row[parents[level]])))
             row[level] = np.arange(len(level))
-            level = np.flatnonzero(np.isin(skeleton.parents, level))
+            level = np.flatnonzero(np.isin(parents, level))
         self._back = torch.argsort(torch.cat([nodes for nodes, _ in self._levels]))
-        self._places = torch.from_numpy(skeleton.places)
+        self._places = torch.from_numpy(self.skeleton.places)
         # the nearest rotation to each node's place in the scene: what scale and shear leave of its axes
         left, _, right = np.linalg.svd(self._world(self._places)[:, :3, :3].numpy())
         self._axes = torch.from_numpy(left @ right)
+        self._rest = self.posed({})
 
     # ---- what can be asked for ---------------------------------------------------------------------------------------
 
     @property
     def clips(self) -> tuple[str, ...]:
-        """Names of the animations."""
         return tuple(clip.name for clip in self.skeleton.clips)
 
     @cached_property
@@ -116,24 +103,20 @@ class SkeletonRig:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """Names of the morph targets; those of one name move together."""
         return tuple(dict.fromkeys(name for name, *_ in self._targets))
 
     @property
     def defaults(self) -> Mapping[str, float]:
-        """Every number at rest."""
         time = {TIME.name: 0.0} if self.clips else {}
         turns = {f"{name}.{axis}": 0.0 for name in self.joints for axis in AXES}
         return time | turns | {f"{name}.{WEIGHT}": rest for name, _, _, rest, _, _ in reversed(self._targets)}
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Time of a clip, turns of joints and weights of morph targets."""
         named = (TIME if name == TIME.name else part_of_a_rig(name) for name in self.defaults)
         return tuple(parameter for parameter in named if parameter is not None)
 
     def measured(self, values: Mapping[str, Tensor], clip: str | None = None) -> Mapping[str, Value]:
-        """Return the seconds of a clip."""
         if clip is None:
             return {}
         return {"seconds": {"value": float(self._playing(clip, values)[1]), "unit": "s"}}
@@ -161,7 +144,13 @@ class SkeletonRig:
             here, weights = self._played(playing, seconds.to(some.device))
         here = self._turned(here, number)
         matrices = (self._world(here)[self._nodes.to(some.device)] @ self._inverse.to(some.device))[:, :3]
-        points, shares = self._morphed(number, weights, some.device), self._weights.to(some.device)
+        points, shares = self._points.to(some.device), self._weights.to(some.device)
+        for name, node, index, rest, rows, shifts in self._targets:
+            weight = number.get(f"{name}.{WEIGHT}")
+            if weight is None:
+                weight = weights[node][index] if node in weights else torch.tensor(rest, dtype=torch.float64)
+            if weight.requires_grad or float(weight) != 0.0:
+                points = points.index_add(0, rows.to(some.device), weight.to(some.device) * shifts.to(some.device))
         joints = self._joints.to(some.device)
         moves = sum(shares[:, k, None, None] * matrices[joints[:, k]] for k in range(joints.shape[1]))
         assert isinstance(moves, Tensor)
@@ -210,16 +199,6 @@ class SkeletonRig:
             here = places[level.to(places.device)]
             levels.append(levels[-1][parents.to(places.device)] @ here if levels else here)
         return torch.cat(levels)[self._back.to(places.device)]
-
-    def _morphed(self, number: Mapping[str, Tensor], weights: Mapping[int, Tensor], device: torch.device) -> Tensor:
-        points = self._points.to(device)
-        for name, node, index, rest, rows, moves in self._targets:
-            weight = number.get(f"{name}.{WEIGHT}")
-            if weight is None:
-                weight = weights[node][index] if node in weights else torch.tensor(rest, dtype=torch.float64)
-            if weight.requires_grad or float(weight) != 0.0:
-                points = points.index_add(0, rows.to(device), weight.to(device) * moves.to(device))
-        return points
 
 
 def sampled(track: Track, seconds: Tensor) -> Tensor:

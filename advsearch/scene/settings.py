@@ -5,7 +5,6 @@ A control takes its declarations from here (`POSE`, `CAMERA`, ...) and adds thos
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -43,7 +42,6 @@ def moving(
     estimators: tuple[str, ...], name: str, unit: str, low: float, high: float, default: float | str, text: str,
     search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
 ) -> Parameter:  # fmt: skip
-    """Return a number that moves outlines."""
     return Parameter(name, (), unit, low, high, default, text, periodic, True, search, log, estimators=estimators)
 
 
@@ -126,8 +124,7 @@ GROUND_KINDS = (
     "snow-avenue",
 )  # fmt: skip
 ROADS, PLACES = (DRY_ROAD, WET_ROAD), (DRY_AVENUE, WET_AVENUE, SNOW_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM)
-PHOTOGRAPHED_FROM = 3.0
-"""Height above the floor from which a photograph is taken of an object whose size is not known, object sizes."""
+PHOTOGRAPHED_FROM = 3.0  # height above the floor of the camera of a photograph, where sizes are not known
 TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in CHANNELS))  # settings that only a table has
 GROUND = (
     Parameter("kind", (), "name", 0.0, len(GROUND_KINDS) - 1.0,
@@ -157,13 +154,8 @@ SETTINGS: Mapping[str, Parameter] = {
     f"{family}.{setting.name}": setting for family, parameters in FAMILIES.items() for setting in parameters
 }
 """Every setting by `family.parameter`; of no other control's parameters."""
-
-
-OF_A_MESH = ("pose", "material")
-"""Families that a scene has once more for each mesh around the object: ``pose:chair.yaw``."""
-
-Given = Mapping[str, float | str | Sequence[float]]
-"""Settings as they are asked for, by name; `resolve` refuses what is no number."""
+OF_A_MESH = ("pose", "material")  # families that a scene has again for each mesh around the object: ``pose:chair.yaw``
+Given = Mapping[str, float | str | Sequence[float]]  # settings by name; `resolve` refuses what is no number
 
 
 def parameter_of(name: str) -> Parameter | None:
@@ -187,22 +179,18 @@ def resolve(given: Given) -> dict[str, float | None]:
     if "camera.elevation" in given and "camera.height" in given:
         raise InputError("`set` camera.elevation and camera.height say the same thing; leave one of them out")
     values = {name: None if isinstance(one.default, str) else one.default for name, one in SETTINGS.items()}
-    return {**values, **{name: _checked(name, value) for name, value in given.items()}}
-
-
-def _checked(name: str, value: object) -> float:
-    setting = parameter_of(name)
-    if setting is None:
-        raise UnknownNameError("scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE.")
-    if setting.options:
-        if value not in setting.options:
-            raise UnknownNameError(name, str(value), setting.options, "Write it as `set` NAME=VALUE.")
-        return float(setting.options.index(str(value)))
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f"`set` {name}: expected a number in {setting.unit}, got {value!r}")
-    number = float(value)
-    if not math.isfinite(number) or not setting.low <= number <= setting.high:
-        raise InputError(
-            f"`set` {name}: expected a number from {setting.low:g} to {setting.high:g} ({setting.unit}), got {number:g}"
-        )
-    return number
+    for name, value in given.items():
+        setting = parameter_of(name)
+        if setting is None:
+            raise UnknownNameError("scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE.")
+        if setting.options:
+            if value not in setting.options:
+                raise UnknownNameError(name, str(value), setting.options, "Write it as `set` NAME=VALUE.")
+            value = setting.options.index(str(value))
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise InputError(f"`set` {name}: expected a number in {setting.unit}, got {value!r}")
+        values[name] = float(value)
+        if not setting.low <= value <= setting.high:  # NaN is not, either
+            inside = f"{setting.low:g} to {setting.high:g} ({setting.unit})"
+            raise InputError(f"`set` {name}: expected a number from {inside}, got {value:g}")
+    return values

@@ -64,8 +64,7 @@ class Silhouette:
 
     def directions(self) -> Doubles:
         """Unit directions (N, 3), one in each covered pixel; all stand for the same area of the picture. Their places
-        within the pixels are a low-discrepancy sequence (Roberts 2018), or an upright edge would hide whole columns at
-        a time."""
+        within pixels are a low-discrepancy sequence (Roberts 2018), or an upright edge would hide whole columns."""
         row, column = np.nonzero(self.mask)
         (height, width), window = self.mask.shape, self.window
         number = np.arange(len(row))
@@ -132,9 +131,8 @@ class Passage:
         return np.array(shares)
 
     def solve(self, wanted: float, outside: float) -> float:
-        """Return the largest angle in radians at which the wanted share is hidden. The thing comes in from `outside`;
-        where it first hides as much as is wanted, it stops. If it never does, the angle at which it hides most is
-        returned."""
+        """Return the largest angle in radians at which the wanted share is hidden: the thing comes in from `outside`,
+        and stops where it first hides as much. If it never does, the angle at which it hides most is returned."""
         angles = np.linspace(outside, 0.0, SCAN)
         shares = self.coverage(angles)
         enough = np.nonzero(shares >= wanted)[0]

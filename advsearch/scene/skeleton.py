@@ -31,12 +31,10 @@ class Clip:
 
     @property
     def begin(self) -> float:
-        """Seconds of the first key."""
         return float(min(track.times[0] for track in self.tracks))
 
     @property
     def end(self) -> float:
-        """Seconds of the last one."""
         return float(max(track.times[-1] for track in self.tracks))
 
 
@@ -89,8 +87,7 @@ def with_above(parents: Sequence[int] | Ints, nodes: Collection[int]) -> set[int
 
 
 def entries_of_turn(x: Any, y: Any, z: Any, w: Any) -> list[Any]:
-    """Return the nine entries, row by row, of the rotation matrix of a unit quaternion with the real part `w`: numbers,
-    arrays or tensors."""
+    """Return the nine entries, row by row, of the rotation of a unit quaternion with real part `w`."""
     return [
         1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
         2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),

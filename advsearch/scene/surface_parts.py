@@ -17,8 +17,7 @@ from advsearch.scene.importing.geometry import Soup, connected, neighbours, unit
 from advsearch.scene.raster import doubled_areas, pixels_in, rasterised, weights_at
 
 ATLAS_SIZE = 512
-ATLAS_PADDING = 4
-"""Charts are kept so many texels apart in an atlas of about `ATLAS_SIZE`: two texels in a texture of half that size."""
+ATLAS_PADDING = 4  # texels between charts in an atlas of `ATLAS_SIZE`: two in a texture of half that size
 _SCALE = 100.0  # xatlas takes faces under about 1e-7 square units for empty
 _FLUSH = 1.0 - 1.5e-4  # xatlas takes neighbours whose normals have a product over 1 - 1e-4 for one plane
 _PLANE = np.cos(np.radians(10.0))  # how far the normals of what it takes for a plane may stray before it matters
@@ -36,8 +35,14 @@ def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
     patch = _patches(soup)
     if apart is not None:
         patch = np.unique(patch * (int(apart.max()) + 1) + apart, return_inverse=True)[1].reshape(-1)
-    if int(patch.max()) >= _MOST_PATCHES:
-        return replace(soup, uvs=_side_by_side(len(soup.faces)))
+    if int(patch.max()) >= _MOST_PATCHES:  # two faces to each cell of a grid
+        count = len(soup.faces)
+        columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
+        cell = np.arange(count) // 2
+        corner = np.stack([cell % columns, cell // columns], axis=1)[:, None, :]
+        half = np.array([[0.05, 0.05], [0.85, 0.05], [0.05, 0.85]])
+        inside = np.where((np.arange(count) % 2 == 0)[:, None, None], half, 1.0 - half)
+        return replace(soup, uvs=np.asarray((corner + inside) / columns))
     groups = grouped(patch)
     for size in (ATLAS_SIZE, 0):  # 0: one atlas, however large
         atlas = xatlas.Atlas()
@@ -56,15 +61,6 @@ def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
     # lookups repeat at the border, where xatlas keeps nothing apart
     margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
     return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(result, 0.0, 1.0))
-
-
-def _side_by_side(count: int) -> Doubles:
-    columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
-    cell = np.arange(count) // 2
-    corner = np.stack([cell % columns, cell // columns], axis=1)[:, None, :]
-    half = np.array([[0.05, 0.05], [0.85, 0.05], [0.05, 0.85]])
-    inside = np.where((np.arange(count) % 2 == 0)[:, None, None], half, 1.0 - half)
-    return np.asarray((corner + inside) / columns)
 
 
 def _patches(soup: Soup) -> Ints:
@@ -86,7 +82,13 @@ def _patches(soup: Soup) -> Ints:
         return np.zeros(len(unit), dtype=np.int64)
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3) / np.sqrt(3.0)
-    facing = _smoothed(unit, f, g) @ np.concatenate([axes, corners]).T
+    own = np.arange(len(unit))
+    links = np.concatenate([f, g, own]), np.concatenate([g, f, own])
+    average = coo_array((np.ones(len(links[0])), links), shape=(len(unit), len(unit))).tocsr()
+    smoothed = unit
+    for _ in range(_SMOOTHING):  # the normals of faces with their neighbours'
+        smoothed = np.nan_to_num(unit_vectors(average @ smoothed))
+    facing = smoothed @ np.concatenate([axes, corners]).T
     direction = facing.argmax(axis=1)
     same = direction[f] == direction[g]
     patch = connected(len(unit), f[same], g[same])
@@ -112,18 +114,8 @@ def _cells(middles: Doubles, patch: Ints) -> Ints:
     return cell
 
 
-def _smoothed(unit: Doubles, f: Ints, g: Ints) -> Doubles:
-    own = np.arange(len(unit))
-    links = np.concatenate([f, g, own]), np.concatenate([g, f, own])
-    average = coo_array((np.ones(len(links[0])), links), shape=(len(unit), len(unit))).tocsr()
-    for _ in range(_SMOOTHING):
-        unit = np.nan_to_num(unit_vectors(average @ unit))
-    return unit
-
-
 CELLS = 64  # cells along each side of the map
-MOST_FACES = 20_000
-"""Faces of a mesh that are counted one by one; those of a larger one are smaller than what a picture shows apart."""
+MOST_FACES = 20_000  # of a mesh, which are counted one by one; smaller ones are not told apart in a picture
 DOUBLED = 0.01  # share of the map that charts may cover twice before the mesh is unwrapped anew
 FLAT = 0.05  # share of the surface that may have no area on the map, likewise
 COVERED = 0.02  # share of the unit square that charts have to cover, likewise
@@ -131,23 +123,14 @@ _FINE = 256  # side of the raster in which charts are looked at
 
 
 class SurfaceParts:
-    """The cells and the faces of a mesh with texture coordinates of whatever kind.
-
-    Attributes:
-        unwrapped: whether the map is another one than that of its own texture coordinates.
-        corners: (F, 3, 2) where each face lies on the map, in [0, 1]; v = 0 is the bottom.
-        by_face: whether the faces are parts too: there are at most `MOST_FACES`.
-        count: number of parts: `CELLS` * `CELLS` cells, row by row from v = 1, and then the faces.
-        covered: (CELLS, CELLS) whether the middle of a cell lies in a chart.
-        face: (count,) the face in the middle of each part; of a cell beside all charts, the nearest one.
-        place, at: (count, 3) the middle of each part, in the mesh's coordinates, and (count, 2) its u and v.
-    """
+    """The cells and the faces of a mesh with texture coordinates of whatever kind."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self._own = mesh.uvs[mesh.faces].astype(np.float64)
+        # whether the map is another one than that of its own texture coordinates
         self.unwrapped = not _tells_apart(mesh, self._own)
-        self.corners = self._own
+        self.corners = self._own  # (F, 3, 2) where each face lies on the map, in [0, 1]; v = 0 is the bottom
         if self.unwrapped:
             low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
             points = (mesh.vertices - low).astype(np.float64) / max(float((high - low).max()), 1e-12)
@@ -159,11 +142,13 @@ class SurfaceParts:
         own = mesh.faces.reshape(-1)
         apart, uvs = np.arange(len(own), dtype=np.uint32).reshape(-1, 3), self.corners.reshape(-1, 2).astype(np.float32)
         charts = rasterised(Mesh(mesh.vertices[own], apart, mesh.normals[own], uvs), CELLS)
-        self.by_face = len(mesh.faces) <= MOST_FACES
+        self.by_face = len(mesh.faces) <= MOST_FACES  # whether the faces are parts too
         faces = np.arange(len(mesh.faces) if self.by_face else 0)
-        self.count = CELLS * CELLS + len(faces)
-        self.covered = charts.covered
+        self.count = CELLS * CELLS + len(faces)  # of the parts: cells, row by row from v = 1, and then the faces
+        self.covered = charts.covered  # (CELLS, CELLS) whether the middle of a cell lies in a chart
         middles = mesh.vertices[mesh.faces[faces]].mean(axis=1)
+        # the face in the middle of each part (count,), of a cell beside all charts the nearest one; that middle (count,
+        # 3), in the mesh's coordinates; and its u and v (count, 2)
         self.face = np.concatenate([charts.face.reshape(-1), faces])
         self.place = np.concatenate([charts.positions().reshape(-1, 3), middles]).astype(np.float64)
         row, column = np.divmod(np.arange(CELLS * CELLS), CELLS)
@@ -177,8 +162,7 @@ class SurfaceParts:
         return {**cells, "face": slice(CELLS * CELLS, self.count)} if self.by_face else cells
 
     def cells(self, face: Ints, uv: Doubles) -> Ints:
-        """Return the cells (n,) of places on the surface: on faces (n,), at the mesh's own texture coordinates (n,
-        2)."""
+        """Return the cells (n,) of places on faces (n,), at the mesh's own texture coordinates (n, 2)."""
         if self.unwrapped:
             weights = weights_at(self._own[face], uv[:, 1], uv[:, 0])  # rows run along v here
             weights = np.clip(np.nan_to_num(weights, nan=1 / 3, posinf=1 / 3, neginf=1 / 3), 0.0, 1.0)

@@ -18,7 +18,6 @@ AOVS: Mapping[str, str] = {
     "id": "number of the mesh; 0 where there is nothing",
 }
 """What can be asked for, and what its values mean."""
-
 CHANNELS: Mapping[str, str] = {"mask": "Y", "depth": "Z", "normal": "XYZ", "uv": "UV", "id": "Y"}
 """The channels of each layer, as EXR calls them."""
 
@@ -51,8 +50,7 @@ class Surfaces:
         return self.id == self.names.index(name) + 1
 
     def layers(self, aovs: Sequence[str], mask: str) -> dict[str, Tensor]:
-        """Return the channels (H, W) of a picture with layers of `AOVS`, such as ``normal.X``; `mask` names the shape
-        of that layer."""
+        """Return the channels (H, W) of layers of `AOVS`, such as ``normal.X``; `mask` names the shape of it."""
         channels: dict[str, Tensor] = {}
         for name in aovs:
             value = self.seen(mask).float() if name == "mask" else getattr(self, name)

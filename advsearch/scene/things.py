@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import LARGEST, SMALLEST, Doubles, ObjectAsset, doubts, footing, sized
+from advsearch.scene.assets import LARGEST, SMALLEST, Doubles, ObjectAsset, doubts, footing, pose_of, sized
 from advsearch.scene.geometry import middle, rotation, standing
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.parts import MeshPart, mesh_part
@@ -145,16 +145,12 @@ def with_things(scene: SceneDescription, text: str | None, load: Callable[[str],
 def _pose(scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres: float) -> Doubles:
     foot, extent = footing(asset.mesh.vertices.astype(np.float64))
     linear = metres / scene.metres / extent * rotation(asked.heading, 0.0, 0.0)
-    matrix = np.eye(4)
-    matrix[:3, :3] = linear
     place = middle(scene)[:2] + np.array([asked.x, asked.y]) / scene.metres
-    matrix[:3, 3] = np.array([*place, ground_height(scene, place)]) - linear @ foot
-    return matrix
+    return pose_of(linear, np.array([*place, ground_height(scene, place)]) - linear @ foot)
 
 
 def ground_height(scene: SceneDescription, place: Doubles) -> float:
-    """Return how high the ground lies at a place (2,), object sizes: that of the road, with its pavements, of a room's
-    table or floor, or 0."""
+    """Return how high the ground lies at a place (2,), object sizes: road, pavement, table or floor; or 0."""
     laid = (part for name, part in scene.around.items() if name in LAID)
     triangles = (standing(part)[part.mesh.faces.astype(np.int64)] for part in laid)
     return max((height for corners in triangles for height in heights_over(corners, place)), default=0.0)

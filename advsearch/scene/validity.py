@@ -24,16 +24,15 @@ import numpy as np
 from advsearch.scene.assets import Doubles
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.grounds import enclosed, paved
+from advsearch.scene.library import BUNDLED_ENVIRONMENT
 from advsearch.scene.places.quads import EDGES, EYE, FRONTS, LENGTH, STREET_ENDS
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
 
 FACTOR = 2.0  # how much too large, or too high, what stands around may be
-RADIUS = 5.0
-"""How far from a photograph's camera its floor is empty, in heights of it, where `ground.radius` is not given."""
-TURNED = 2.0
-"""Degrees that a street's map may be turned by: its houses then stand beside its road as far as that is laid."""
+RADIUS = 5.0  # how far from a photograph's camera its floor is empty, in heights of it, where nothing says so
+TURNED = 2.0  # degrees that a street's map may be turned by: its houses then stand beside its road
 Box = tuple[float, float, float, float]
 """From and to in x, from and to in y, metres or object sizes, with the object at (0, 0)."""
 
@@ -84,7 +83,7 @@ def surroundings_of(scene: SceneDescription) -> Surroundings | None:
     if lit is None or scene.backdrop or enclosed(scene):  # what encloses the object is geometry, true from everywhere
         return None
     laid: Box | float = (-LENGTH / 2.0, LENGTH / 2.0, *EDGES) if paved(scene) else math.inf
-    if lit.ground is not None and scene.bundled_environment is not None and paved(scene):
+    if lit.ground is not None and lit.source == BUNDLED_ENVIRONMENT and paved(scene):
         stands = (-STREET_ENDS, STREET_ENDS, *FRONTS)
         return Surroundings(EYE, stands, laid, scene.number("environment.rotation"))
     if lit.photographed and (paved(scene) or scene.photograph is not None):
@@ -122,9 +121,8 @@ def past(scene: SceneDescription, views: Sequence[CameraView], *, turns: bool = 
             "across it; leave the rotation out",
         )
     limits = [valid(around, view) for view in views]
-    beyond = [
-        view for view, (far, high) in zip(views, limits, strict=True) if view.distance > far or view.height > high
-    ]
+    each = zip(views, limits, strict=True)
+    beyond = [view for view, (far, high) in each if view.distance > far or view.height > high]
     if not beyond:
         return ()
     near, far = min(limits)[0], max(limits)[0]

@@ -13,7 +13,6 @@ from advsearch.settings.values import (
     as_text,
     check_once,
     each_once,
-    is_shallow,
     names_together,
     number_or_text,
     parse_assignment,
@@ -26,6 +25,6 @@ from advsearch.settings.values import (
 
 __all__ = [
     "FILES", "HEADER", "Clash", "Config", "Setting", "all_finite", "as_python", "as_text", "check_once", "each_once",
-    "is_shallow", "names_together", "number_or_text", "parse_assignment", "read_controls", "read_yaml", "setting",
+    "names_together", "number_or_text", "parse_assignment", "read_controls", "read_yaml", "setting",
     "setting_as_in", "settings", "shown", "split_names", "texts",
 ]  # fmt: skip

@@ -5,6 +5,7 @@ A configuration is what a command needs to know, checked as a whole, and as word
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
-from advsearch.files import JsonObject, split_paths
+from advsearch.files import JsonObject, is_shallow, split_paths
 from advsearch.settings import values as written
 from advsearch.settings.power import LeftOut, Power, none
 
@@ -114,9 +115,7 @@ def _expected(info: FieldInfo) -> str:
     if get_origin(info.annotation) is Literal or get_origin(kinds[0]) is Literal:
         *first, last = kinds if get_origin(info.annotation) is Literal else get_args(kinds[0])
         return f"{', '.join(first)} or {last}"
-    limits = {
-        name: getattr(limit, name) for limit in info.metadata for name in ("ge", "gt", "le") if hasattr(limit, name)
-    }
+    limits = {name: getattr(part, name) for part in info.metadata for name in ("ge", "gt", "le") if hasattr(part, name)}
     number = "a whole number" if kinds == [int] else "a number"
     most = limits["le"] if kinds == [int] else f"{limits['le']:g}".replace("e+0", "e")
     if "gt" in limits:
@@ -181,10 +180,8 @@ class Config(BaseModel):
     command: ClassVar[str]
     without: ClassVar[tuple[str, ...]] = ()  # settings of a class above that the command does not have
     clashes: ClassVar[tuple[Clash, ...]] = ()
-    formerly: ClassVar[Mapping[str, str]] = {}
-    """Names that settings had before, with those of now; files and flags may still have them."""
-    free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")
-    """Settings that decide no number, so that they may be changed before a run goes on."""
+    formerly: ClassVar[Mapping[str, str]] = {}  # earlier names of settings, which files and flags may still have
+    free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")  # they decide no number: they may change before a run goes on
 
     _only_here: tuple[str, ...] = PrivateAttr(())
     _left_out: tuple[LeftOut, ...] = PrivateAttr(())
@@ -193,7 +190,7 @@ class Config(BaseModel):
 
     def __init__(self, **data: Any) -> None:
         data = {self.formerly.get(name, name): value for name, value in data.items()}
-        deep = {name: value for name, value in data.items() if not written.is_shallow(value)}
+        deep = {name: value for name, value in data.items() if not is_shallow(value)}
         if deep:
             raise _settings_error(type(self), [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])
         try:
@@ -272,8 +269,7 @@ class Config(BaseModel):
 
     @property
     def asked(self) -> dict[str, Any]:
-        """The settings that may have such power and decide no number, by name: a part of a run has them from this
-        sitting, not from its own file."""
+        """The settings that may have such power and decide no number: parts of a run have them from this sitting."""
         return {
             setting.name: getattr(self, setting.field)
             for setting in settings(type(self))
@@ -384,6 +380,6 @@ def _absolute(name: str) -> str:
     # of two files as in camera.csv+object.csv, that of each; of what is no file, its name
     if len(both := split_paths(name)) > 1:
         return "+".join(map(_absolute, both))
-    path, mark, part = (name, "", "") if written.is_file(name) else name.partition("#")
-    is_path = ("/" in path or Path(path).suffix != "") and written.is_file(path)
+    path, mark, part = (name, "", "") if os.path.isfile(name) else name.partition("#")
+    is_path = ("/" in path or Path(path).suffix != "") and os.path.isfile(path)
     return f"{Path(path).resolve()}{mark}{part}" if is_path else name

@@ -60,8 +60,7 @@ def beside_suite(wanted: str | bool | None) -> str:
 
 
 class LeftOut(NamedTuple):
-    """A setting of a file with power over more than its run: its name and field, the value there, what that does, and
-    the default."""
+    """A setting of a file with power over more than its run: name, field, value, what that does, and the default."""
 
     name: str
     field: str

@@ -6,6 +6,7 @@ A YAML file lies over the files that its `base` names.
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,18 +16,10 @@ from pydantic import ValidationInfo, field_validator
 
 from advsearch.distributions import OwnQuantiles
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import read_text
+from advsearch.files import parsed, present_text
 from advsearch.yaml_text import LARGEST, parse_yaml
 
-DEEPEST = 16  # lists and mappings inside one another that a setting may have
-
 LARGEST_WHOLE = 2**63 - 1
-
-
-def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
-    """Return whether lists and mappings are nested at most so deep in `value`."""
-    inner = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
-    return levels >= 0 and all(is_shallow(part, levels - 1) for part in inner)
 
 
 def as_python(value: Any) -> Any:
@@ -139,7 +132,7 @@ def _parts(text: str) -> list[str]:
 
 def split_names(text: str) -> tuple[str, ...]:
     """Return the parts of ``mug,bowl``; a file whose name has a comma is one part."""
-    if "," not in text or is_file(text):
+    if "," not in text or os.path.isfile(text):
         return (text,)
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
@@ -147,13 +140,6 @@ def split_names(text: str) -> tuple[str, ...]:
 def names_together(texts: Iterable[str]) -> str:
     """Return the parts of several such texts as one, each once."""
     return ",".join(dict.fromkeys(name for text in texts for name in split_names(text)))
-
-
-def is_file(name: str) -> bool:
-    try:
-        return Path(name).is_file()
-    except OSError:  # longer than a file's name may be
-        return False
 
 
 def check_once(names: Iterable[str], setting: str) -> None:
@@ -173,10 +159,8 @@ def shown(value: Any) -> str:
 
 
 SCHEMA, OLDEST = 2, 1  # version of the YAML form, and the oldest that is read
-
 HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
 """First line of every `run.yaml` that advsearch writes; a run directory is recognised by it."""
-
 MOST_BASES = 4  # most files that a `base` names, and most that are one another's base
 NAMED = ("policy", "task")  # the settings that are a name, or a `name` with options
 
@@ -184,14 +168,8 @@ NAMED = ("policy", "task")  # the settings that are a name, or a `name` with opt
 def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, object]:
     """Return the mapping in the YAML file at `path`, laid over the files that its `base` names; `above` are those that
     have named it as theirs. A base is a file, relative to this one, or a list of files of which a later one goes over
-    an earlier one; mappings are merged. Raises FileFormatError: the file is missing, empty, not text, not YAML or not a
-    mapping with names as keys."""
-    try:
-        data = parse_yaml(read_text(Path(path), "a YAML file", LARGEST))
-    except OSError as error:
-        raise FileFormatError(f"{path}: expected a YAML file, got {error.strerror}; check the path") from None
-    except ValueError as error:
-        raise FileFormatError(f"{path}: expected YAML, got {error}; correct the file") from None
+    an earlier one; mappings are merged. Raises FileFormatError: it is missing, not YAML or no mapping from names."""
+    data = parsed(path, present_text(path, "a YAML file", LARGEST), "YAML", parse_yaml)
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
         got = "an empty file" if data is None else type(data).__name__
         raise FileFormatError(f"{path}: expected settings and values such as 'object: mug', got {got}")

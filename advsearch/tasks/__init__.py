@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -23,24 +23,18 @@ from advsearch.tasks.segmentation import Segmentation
 from advsearch.tasks.similarity import Similarity
 from advsearch.tasks.together import Rig, Together
 
-MOST_NUMBERS = 4
-"""Of an output that are said one by one."""
+MOST_NUMBERS = 4  # of an output that are said one by one
 
 
 @dataclass(frozen=True, kw_only=True)
 class OwnTask(Task):
-    """A task by one function, see `own_task`; its truth are the scene's facts in each configuration.
-
-    Args:
-        function: from an output (N, ...) and facts to (N,): over 0 exactly where the output is wrong.
-        labels: one name per class where the model has names; else empty.
-    """
+    """A task by one function, see `own_task`; its truth are the scene's facts in each configuration."""
 
     name = "own"
     varies = True
 
     function: Callable[[Any, Facts], Tensor]
-    labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)
+    labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)  # empty where the model has no names
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> OwnTask:
         asked = super().on(model, target=target, minimise=minimise)
@@ -63,15 +57,17 @@ class OwnTask(Task):
 
     def predictions(self, output: Any, count: int = 1) -> list[tuple[Prediction, ...]]:
         """Return the largest class of each output where classes have names, else its numbers."""
-        return [(self._prediction(one),) for one in output.detach()]
-
-    def _prediction(self, one: Tensor) -> Prediction:
-        if one.ndim == 1 and len(one) == len(self.labels):
-            index = int(one.argmax())
-            return Prediction(self.labels[index], index)
-        if one.numel() <= MOST_NUMBERS:
-            return Prediction(", ".join(f"{value:.3g}" for value in one.flatten().tolist()))
-        return Prediction(f"{' x '.join(map(str, one.shape))} numbers, mean {float(one.double().mean()):.3g}")
+        found: list[tuple[Prediction, ...]] = []
+        for one in output.detach():
+            index = int(one.argmax()) if one.ndim == 1 and len(one) == len(self.labels) else None
+            if index is not None:
+                label = self.labels[index]
+            elif one.numel() <= MOST_NUMBERS:
+                label = ", ".join(f"{value:.3g}" for value in one.flatten().tolist())
+            else:
+                label = f"{' x '.join(map(str, one.shape))} numbers, mean {float(one.double().mean()):.3g}"
+            found.append((Prediction(label, index),))
+        return found
 
     def truth_names(self, truth: Facts) -> tuple[str, ...]:
         return (truth.label or truth.own_label or truth.object,)
@@ -120,11 +116,8 @@ def make_task(task: AnyTask) -> Task:
     """Return the task of that name, of that `name` with these options, which are its dataclass's fields, the task
     itself, or that of a function (`own_task`).
 
-    Of several tasks at once, "detection+depth", the options of each stand under its name.
-
-    Raises:
-        UnknownNameError: no such task, or it has no such option.
-        InputError: an option's value is of another type, or outside its range.
+    Of several tasks at once, "detection+depth", the options of each stand under its name. Raises UnknownNameError: no
+    such task, or it has no such option; InputError: an option's value is of another type, or outside its range.
     """
     if isinstance(task, Task):
         return task
@@ -133,9 +126,16 @@ def make_task(task: AnyTask) -> Task:
     if not isinstance(task, (str, Mapping)):
         raise InputError(f"task: expected a name, a mapping with a `name`, a Task or a function, got {told(task)}")
     given = {"name": task} if isinstance(task, str) else task
-    name, options = str(given.get("name", Classification.name)), {key: given[key] for key in given if key != "name"}
+    name = str(given.get("name", Classification.name))
+    options: dict[str, Any] = {key: given[key] for key in given if key != "name"}
     if JOINED in name:
-        return _together([one.strip() for one in name.split(JOINED)], options)
+        names = [part.strip() for part in name.split(JOINED)]
+        for part, of_part in options.items():
+            if part not in names:
+                raise UnknownNameError(f"option of task {JOINED.join(names)!r}:", part, names)
+            if not isinstance(of_part, Mapping):
+                raise InputError(f"task {part}: expected its options as a mapping, got {of_part!r:.80}")
+        return Together(parts=tuple(make_task({**options.get(part, {}), "name": part}) for part in names))
     if name not in TASKS:
         raise UnknownNameError("task", name, TASKS)
     check_options("task", name, TASKS[name], options)
@@ -144,34 +144,7 @@ def make_task(task: AnyTask) -> Task:
     return replace(made, part=make_task(made.task)) if isinstance(made, Rig) else made
 
 
-def _together(names: Sequence[str], options: Mapping[str, Any]) -> Together:
-    """Return several tasks as one, from their names, and by name the options of those that have some."""
-    for name, own in options.items():
-        if name not in names:
-            raise UnknownNameError(f"option of task {JOINED.join(names)!r}:", name, names)
-        if not isinstance(own, Mapping):
-            raise InputError(f"task {name}: expected its options as a mapping, got {own!r:.80}")
-    return Together(parts=tuple(make_task({**options.get(name, {}), "name": name}) for name in names))
-
-
 __all__ = [
-    "TASKS",
-    "AnyTask",
-    "Classification",
-    "Command",
-    "Depth",
-    "Detection",
-    "Facts",
-    "FreeAnswer",
-    "Judgement",
-    "Mark",
-    "OwnTask",
-    "Prediction",
-    "Segmentation",
-    "Sight",
-    "Similarity",
-    "Task",
-    "function_of",
-    "make_task",
-    "own_task",
+    "TASKS", "AnyTask", "Classification", "Command", "Depth", "Detection", "Facts", "FreeAnswer", "Judgement", "Mark",
+    "OwnTask", "Prediction", "Segmentation", "Sight", "Similarity", "Task", "function_of", "make_task", "own_task",
 ]  # fmt: skip

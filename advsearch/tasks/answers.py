@@ -20,11 +20,8 @@ from advsearch.tasks.base import Facts, Prediction, Said, Task
 
 Words = tuple[str, ...]
 
-SILENCE = "(nothing)"
-"""What an answer without a word is called."""
-
-MOST = 256
-"""Most tokens of an answer."""
+SILENCE = "(nothing)"  # what an answer without a word is called
+MOST = 256  # most tokens of an answer
 
 
 class Texts(TypedDict):
@@ -93,11 +90,8 @@ class FreeAnswer(Task):
         self.truth(facts)
 
     def truth(self, facts: Facts) -> Words:
-        """Return the right words: what was said, or else the object's own label.
-
-        Raises:
-            InputError: there are none, or one is the target too.
-        """
+        """Return the right words: what was said, or else the object's own label. Raises InputError: there are none, or
+        one is the target too."""
         text = facts.own_label if facts.label is None else facts.label
         if text is None:
             raise InputError(f"label: expected the right words for {facts.object}, got none")
@@ -110,7 +104,23 @@ class FreeAnswer(Task):
         return truth
 
     def loss(self, output: Sequence[Utterance | Texts], truth: Words) -> Tensor:
-        return torch.stack([_loss(one, truth) for one in output])
+        losses = []
+        for one in output:
+            if "texts" in one:
+                shares = torch.tensor([float(has_word(text, truth)) for text in _texts(one)])
+                losses.append(1.0 - 2.0 * shares.mean())
+                continue
+            logits, begin = one["logits"], sorted({number for word in truth for number in one["begins"](word)})
+            if not begin:
+                raise InputError(f"label: the model has no token that begins one of {', '.join(truth)}; name others")
+            inside = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
+            inside[begin] = True
+            best, other = (logits.masked_fill(hidden, -torch.inf).amax(dim=1) for hidden in (~inside, inside))
+            lead = (best - other).max()
+            losses.append(
+                functional.logsigmoid(-lead) if has_word(one["text"], truth) else -functional.logsigmoid(lead)
+            )
+        return torch.stack(losses)
 
     def predictions(self, output: Sequence[Utterance | Texts], count: int = 1) -> list[tuple[Prediction, ...]]:
         """Return the text of each picture, the most frequent first, in one line without signs that steer a terminal."""
@@ -148,16 +158,3 @@ def has_word(text: str, words: Words) -> bool:
     """Whether a text has one of some words, or terms of several, in any case; "mug" is no word of "smug"."""
     text = " ".join(text.split()).casefold()
     return any(re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text) for word in words)
-
-
-def _loss(one: Utterance | Texts, words: Words) -> Tensor:
-    if "texts" in one:
-        return 1.0 - 2.0 * torch.tensor([float(has_word(text, words)) for text in _texts(one)]).mean()
-    logits, begin = one["logits"], sorted({number for word in words for number in one["begins"](word)})
-    if not begin:
-        raise InputError(f"label: the model has no token that begins one of {', '.join(words)}; name others")
-    inside = torch.zeros(logits.shape[1], dtype=torch.bool, device=logits.device)
-    inside[begin] = True
-    low = -torch.inf
-    lead = (logits.masked_fill(~inside, low).amax(dim=1) - logits.masked_fill(inside, low).amax(dim=1)).max()
-    return functional.logsigmoid(-lead) if has_word(one["text"], words) else -functional.logsigmoid(lead)

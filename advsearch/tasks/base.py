@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -24,12 +25,8 @@ from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.options import FROM_RUN
 
-Output = Any
-"""What a model returns for N pictures: a tensor (N, ...), or a list with one thing for each picture."""
-
-Truth = Any
-"""What is true of a scene, as its task needs it: the right classes, a number, boxes."""
-
+Output = Any  # what a model returns for N pictures: a tensor (N, ...), or a list with one thing for each picture
+Truth = Any  # what is true of a scene, as its task needs it: the right classes, a number, boxes
 Own = TypeVar("Own", bound="Task")
 
 
@@ -97,8 +94,7 @@ class Judgement:
         return self.prediction.label == NOT_A_NUMBER
 
 
-Said = tuple[Prediction, JsonValue]
-"""What a model says of a picture, and what else is kept of it."""
+Said = tuple[Prediction, JsonValue]  # what a model says of a picture, and what else is kept of it
 
 
 @dataclass(frozen=True)
@@ -175,10 +171,7 @@ class Facts:
         """The pixels of the picture in which the object is the first thing that the camera sees, (H, W) bool.
 
         Each is asked for at its middle. Where something hides the object, it is not seen; an image corruption leaves
-        the mask as it is.
-
-        Raises:
-            InputError: as for `sight`.
+        the mask as it is. Raises InputError: as for `sight`.
         """
         return self.sight.mask.clone()
 
@@ -187,30 +180,21 @@ class Facts:
         """How far what is seen in each pixel is from the camera, along the ray, (H, W) float32.
 
         In metres; in object sizes where the size of the object is not known. Infinite where there is nothing but the
-        environment. Asked for and unaffected as the mask is.
-
-        Raises:
-            InputError: as for `sight`.
+        environment. Asked for and unaffected as the mask is. Raises InputError: as for `sight`.
         """
         return self.sight.depth.clone()
 
     @property
     def z_depth(self) -> Tensor:
-        """The part of `depth` that lies along the camera's axis, (H, W) float32: what a depth camera gives.
-
-        Raises:
-            InputError: as for `sight`.
-        """
+        """The part of `depth` that lies along the camera's axis, (H, W) float32: what a depth camera gives. Raises
+        InputError: as for `sight`."""
         return self.sight.z_depth.clone()
 
     @cached_property
     def box(self) -> tuple[int, int, int, int] | None:
         """The smallest box round what is seen of the object: x0, y0, x1, y1 in pixels from the top left.
 
-        The pixels have x0 <= x < x1 and y0 <= y < y1. None where nothing is seen.
-
-        Raises:
-            InputError: as for `sight`.
+        The pixels have x0 <= x < x1 and y0 <= y < y1. None where nothing is seen. Raises InputError: as for `sight`.
         """
         columns, rows = (self.mask.any(dim=side).nonzero().flatten().tolist() for side in (0, 1))
         return (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1) if rows else None
@@ -221,11 +205,8 @@ class Facts:
         return MappingProxyType(dict(self.describe()))
 
     def number(self, name: str) -> float:
-        """Return the number that a parameter has in this configuration.
-
-        Raises:
-            InputError: nothing in the scene is called that.
-        """
+        """Return the number that a parameter has in this configuration. Raises InputError: nothing in the scene is
+        called that."""
         if name not in self.numbers:
             known = ", ".join(sorted(self.numbers)) or "none"
             raise InputError(
@@ -267,18 +248,7 @@ class Task(ABC):
         super().__init_subclass__(**more)
         for old in FORMERLY.keys() & vars(cls).keys():
             raise InputError(f"task {cls.__name__}: `{old}` is called `{FORMERLY[old]}` now; rename it")
-        asked = (
-            "loss",
-            "score",
-            "predictions",
-            "payloads",
-            "marks",
-            "judge",
-            "said",
-            "average",
-            "after_calibration",
-            "as_logits",
-        )
+        asked = "loss score predictions payloads marks judge said average after_calibration as_logits".split()
         hand_copies(cls, truth_names=slice(None), **dict.fromkeys(asked, slice(None)))
 
     def check_numbers(self, fits: Callable[[float], bool], expected: str, *names: str) -> None:
@@ -293,11 +263,8 @@ class Task(ABC):
 
     @abstractmethod
     def truth(self, facts: Facts) -> Truth:
-        """Return what is true of the scene.
-
-        Raises:
-            InputError: the facts do not say it, or the model cannot predict it.
-        """
+        """Return what is true of the scene. Raises InputError: the facts do not say it, or the model cannot predict
+        it."""
 
     @abstractmethod
     def loss(self, output: Output, truth: Truth) -> Tensor:
@@ -315,10 +282,8 @@ class Task(ABC):
     def read(self, returned: Any, count: int) -> Output:
         """Return the output in what a network returned for `count` pictures.
 
-        Not called where the task `reads_logits`. What a network returns for each picture is kept in this order.
-
-        Raises:
-            ValueError: there is none; the text says what was expected.
+        Not called where the task `reads_logits`. What a network returns for each picture is kept in this order. Raises
+        ValueError: there is none; the text says what was expected.
         """
         if isinstance(returned, Tensor) and returned.shape[:1] == (count,):
             return returned.float()
@@ -378,11 +343,8 @@ class Task(ABC):
         return self
 
     def check(self, facts: Facts) -> None:
-        """Refuse a scene of which nothing could be judged, before anything is rendered.
-
-        Raises:
-            InputError: as for `truth`.
-        """
+        """Refuse a scene of which nothing could be judged, before anything is rendered. Raises InputError: as for
+        `truth`."""
         if not self.varies:
             self.truth(facts)
 
@@ -447,10 +409,7 @@ class Task(ABC):
 def typical(judgements: Sequence[Judgement]) -> Judgement:
     """Return what the model usually says: the most frequent prediction (the lowest index of equals), with the mean
     score, margin and probability of the judgements that have it."""
-    counts: dict[tuple[str, int | None], int] = {}
-    for one in judgements:
-        key = one.prediction.label, one.prediction.index
-        counts[key] = counts.get(key, 0) + 1
+    counts = Counter((one.prediction.label, one.prediction.index) for one in judgements)
     label, index = min(counts, key=lambda key: (-counts[key], key[1] or 0))
     chosen = [one for one in judgements if (one.prediction.label, one.prediction.index) == (label, index)]
     sure = [one.prediction.probability for one in chosen if one.prediction.probability is not None]

@@ -24,26 +24,16 @@ from advsearch.tasks.base import Facts, Judgement, Output, Prediction, Task
 Labels = tuple[int, ...]
 Own = TypeVar("Own", bound="ClassTask")
 
-NO = "no "
-"""How a prediction says that the object is not found."""
+NO = "no "  # how a prediction says that the object is not found
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClassTask(Task):
-    """A task whose model knows classes by number.
+    """A task whose model knows classes by number. Raises InputError: there is a target to minimise."""
 
-    Args:
-        labels: one name per class; numbers stand in for names that are not there.
-        named: False if `labels` are placeholders.
-        target: indices of classes; where there are some, only these are a success.
-
-    Raises:
-        InputError: there is a target to minimise.
-    """
-
-    labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)
+    labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)  # one name per class, or a placeholder
     named: bool = field(default=True, metadata=FROM_RUN)
-    target: Labels | None = field(default=None, metadata=FROM_RUN)
+    target: Labels | None = field(default=None, metadata=FROM_RUN)  # where there are some, only these are a success
 
     def __post_init__(self) -> None:
         if self.target is not None and self.minimise:
@@ -95,6 +85,9 @@ class ClassTask(Task):
         if both:
             raise InputError(f"target: expected classes that are not right labels, got {both}, which `label` has too")
         return right
+
+    def check(self, facts: Facts) -> None:
+        self.right_classes(facts)
 
     @cached_property
     def nothing(self) -> Labels:

@@ -21,17 +21,13 @@ from advsearch.tasks.base import Facts, Prediction, Said, Task
 
 Numbers = tuple[float, ...]
 
-MOST = 4096
-"""Numbers of a state, names of one, and elements of an action."""
-
-LARGEST = 1 << 20
-"""Bytes of a file with a state."""
+MOST = 4096  # numbers of a state, names of one, and elements of an action
+LARGEST = 1 << 20  # bytes of a file with a state
 
 INSIDE, REACHED = "action within its envelope", "action within the envelope of the target"
 """Labels of actions; others are outside of their envelope."""
 
-SHOWN = 4
-"""Elements of an action that are said in words."""
+SHOWN = 4  # elements of an action that are said in words
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +43,6 @@ class Command(Task):
         envelope: how far an element may be off, in its own unit: a number, or one for each element.
         names: of the elements, a list or a text with commas; "action 1" and so on without.
         units: of the elements, likewise, or one for all.
-        clean: (A,) the clean action; None before it was seen.
 
     Raises:
         InputError: a value of another type, or out of range.
@@ -61,13 +56,20 @@ class Command(Task):
     envelope: Any = None
     names: Any = ()
     units: Any = ()
-    clean: Tensor | None = field(default=None, compare=False, repr=False, metadata=FROM_RUN)
+    clean: Tensor | None = field(default=None, compare=False, repr=False, metadata=FROM_RUN)  # (A,)
 
     def __post_init__(self) -> None:
         put = object.__setattr__  # what files and lists say, in the one form that compares and is written down
         put(self, "state", _state(self.state))
-        for name in ("names", "units"):
-            put(self, name, _texts(name, getattr(self, name)))
+        for option in ("names", "units"):
+            given = getattr(self, option)
+            texts = (
+                [part.strip() for part in given.split(",")] if isinstance(given, str) and given else [*(given or ())]
+            )
+            if len(texts) > MOST or not all(isinstance(one, str) and one and one.isprintable() for one in texts):
+                expected = "expected texts, or one with commas between them"
+                raise InputError(f"task command: {option}: {expected}, got {given!r:.80}")
+            put(self, option, tuple(texts))
         if len(set(self.names)) < len(self.names):
             raise InputError(f"task command: names: expected different names, got {', '.join(self.names):.80}")
         if self.envelope is not None:
@@ -98,12 +100,9 @@ class Command(Task):
         return found.float()
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Command:
-        """See `Task.on`: the target is an action, ``0.1,-0.3``, or some of its elements, ``yaw rate=-0.3``.
-
-        Raises:
-            InputError: there is no envelope, the model was loaded for another task or with names of classes, the
-                target is none, or the clean action is sought.
-        """
+        """See `Task.on`: the target is an action, ``0.1,-0.3``, or some of its elements, ``yaw rate=-0.3``. Raises
+        InputError: there is no envelope, the model was loaded for another task or with names of classes, the target is
+        none, or the clean action is sought."""
         if model.read is None:
             raise InputError(f'model {model.name}: it was loaded for its logits; load it with task="command"')
         if model.labels:
@@ -203,7 +202,7 @@ class Command(Task):
             label = REACHED if hit else INSIDE if margin >= 0.0 else f"action outside its envelope ({side})"
             text = f"{self._said(action)}, clean {self._said(truth.tolist(), named=False)}"
             kept = {"action": action, "clean": truth.tolist(), "envelopes": 1.0 - margin, "text": text}
-            found.append((Prediction(label), kept if math.isfinite(margin) else None))
+            found.append((Prediction(label), kept))
         return found
 
     def _name(self, place: int) -> str:
@@ -234,13 +233,6 @@ def _numbers(option: str, given: Any) -> Numbers:
             f"task command: {option}: expected a finite number, or a list of 1 to {MOST} of them, got {got}"
         )
     return found
-
-
-def _texts(option: str, given: Any) -> tuple[str, ...]:
-    listed = [part.strip() for part in given.split(",")] if isinstance(given, str) and given else list(given or ())
-    if len(listed) > MOST or not all(isinstance(one, str) and one and one.isprintable() for one in listed):
-        raise InputError(f"task command: {option}: expected texts, or one with commas between them, got {given!r:.80}")
-    return tuple(listed)
 
 
 def _state(given: Any) -> dict[str, Numbers]:

@@ -25,8 +25,7 @@ from advsearch.models import Model
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Facts, Mark, Prediction, Said, Task
 
-ASIDE = 0.1
-"""Cosine of the angle to the camera's axis from which on z-depth is no distance any more."""
+ASIDE = 0.1  # cosine of the angle to the camera's axis from which on z-depth is no distance any more
 DISPARITY, RELATIVE, METRIC = "relative disparity", "relative depth", "metric depth"
 
 KINDS = {
@@ -36,28 +35,20 @@ KINDS = {
 }
 """What a model's numbers may be."""
 
-AS_FAR, NEARER, FARTHER, GONE = (
-    "as far as it is",
-    "nearer than it is",
-    "farther than it is",
-    "as far as what is behind it",
-)
-OUT_OF_SHAPE = "out of shape"
-
+AS_FAR, OUT_OF_SHAPE = "as far as it is", "out of shape"
+NEARER, FARTHER, GONE = "nearer than it is", "farther than it is", "as far as what is behind it"
+LABELS = {"nearer": NEARER, "farther": FARTHER, "gone": GONE}
 GOALS = {
-    "nearer": "the object is judged nearer than it is",
-    "farther": "the object is judged farther than it is",
-    "gone": "the object is judged to be as far as what is behind it",
+    "nearer": f"the object is judged {NEARER}",
+    "farther": f"the object is judged {FARTHER}",
+    "gone": f"the object is judged to be {GONE}",
 }
 """What an attack may be after, by the name of the objective."""
-
-LABELS = {"nearer": NEARER, "farther": FARTHER, "gone": GONE}
 
 FEWEST, SPREAD = 16, 1.1
 """Pixels beside the object on which scale and shift are found, at least, and how many times as far as the nearest of
 them the farthest is."""
-LARGEST = 100.0
-"""The largest factor by which a pixel counts as too near or too far."""
+LARGEST = 100.0  # the largest factor by which a pixel counts as too near or too far
 
 Map = Mapping[str, Tensor]
 """What a model returns for one picture: (h, w), by one of `KINDS`, or by "" where it does not say."""
@@ -96,11 +87,9 @@ class Distances:
 
     @cached_property
     def behind(self) -> Tensor:
-        """The disparity of what is behind the object, as far as it can be told, (H, W): NaN where it can't.
-
-        It is that of the nearest pixels beside the object in the same row, in a straight line between both: exact of a
-        plane. What is infinitely far has a disparity of 0.
-        """
+        """The disparity of what is behind the object, as far as it can be told, (H, W): NaN where it can't. It is that
+        of the nearest pixels beside the object in the same row, in a straight line between both: exact of a plane. What
+        is infinitely far has a disparity of 0."""
         height, width = self.mask.shape
         inverse, column = self.z.reciprocal(), torch.arange(width).expand(height, width)
         left = torch.where(self.mask, -1, column).cummax(dim=1).values
@@ -123,8 +112,6 @@ class Depth(Task):
         size: of the real object, its longest side in metres, for a model that predicts metres; the scene's own
             without it.
         seek: what an attack is after, one of `GOALS`; "" for any wrong distance.
-        seen_kind: what the network says; "" where it has not yet.
-        missing: what its user has to say before predictions can be judged; empty where nothing is missing.
 
     Raises:
         InputError: a value that is none of these.
@@ -138,8 +125,8 @@ class Depth(Task):
     kind: str = ""
     size: float = 0.0
     seek: str = ""
-    seen_kind: str = field(default="", metadata=FROM_RUN)
-    missing: str = field(default="", metadata=FROM_RUN)
+    seen_kind: str = field(default="", metadata=FROM_RUN)  # what the network says
+    missing: str = field(default="", metadata=FROM_RUN)  # what its user has to say before predictions can be judged
 
     def __post_init__(self) -> None:
         self.check_numbers(lambda value: 0.0 < value < LARGEST, "a number over 0, under 100", "tolerance")
@@ -151,11 +138,8 @@ class Depth(Task):
     # ---- what is read -----------------------------------------------------------------------------------------------
 
     def read(self, returned: Any, count: int) -> list[Map]:
-        """Return the map (h, w) of each picture in what a network returned, by what its numbers are.
-
-        Raises:
-            ValueError: there is none.
-        """
+        """Return the map (h, w) of each picture in what a network returned, by what its numbers are. Raises ValueError:
+        there is none."""
         kind = ""
         if isinstance(returned, Mapping):
             kind = next((one for one in KINDS if one in returned), "")
@@ -175,11 +159,8 @@ class Depth(Task):
         return [{kind: one} for one in returned.float()]
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Depth:
-        """See `Task.on`.
-
-        Raises:
-            InputError: the model was loaded for another task or with names of classes, or there is a target.
-        """
+        """See `Task.on`. Raises InputError: the model was loaded for another task or with names of classes, or there is
+        a target."""
         if model.read is None:
             raise InputError(f'model {model.name}: it was loaded for its logits; load it with task="depth"')
         if model.labels:
@@ -232,20 +213,13 @@ class Depth(Task):
         return (f"{text}, which are found by least squares on what is seen beside the object.",)
 
     def check(self, facts: Facts) -> None:
-        """See `Task.check`.
-
-        Raises:
-            InputError: there is a label.
-        """
+        """See `Task.check`. Raises InputError: there is a label."""
         if facts.label is not None:
             raise InputError("label: task depth has no classes; leave it out")
 
     def truth(self, facts: Facts) -> Distances:
-        """Return where the object is seen, and how far everything is.
-
-        Raises:
-            InputError: the lens sees so far aside that the distance along its axis says nothing.
-        """
+        """Return where the object is seen, and how far everything is. Raises InputError: the lens sees so far aside
+        that the distance along its axis says nothing."""
         if bool((facts.z_depth < ASIDE * facts.depth).any()):
             raise InputError(
                 "task depth: a model's depth is the distance along the camera's axis, and this lens sees things more "
@@ -259,21 +233,16 @@ class Depth(Task):
     # ---- scores -----------------------------------------------------------------------------------------------------
 
     def loss(self, output: Sequence[Map], truth: Distances) -> Tensor:
-        """Return by how much more than the tolerance the object's distance is off, (N,).
-
-        That is the mean over its pixels of |log(judged / true)|, less log(1 + tolerance).
-        """
+        """Return by how much more than the tolerance the object's distance is off, (N,). That is the mean over its
+        pixels of |log(judged / true)|, less log(1 + tolerance)."""
         return self._each(output, truth, lambda factors: factors.abs().mean() - self._bar)
 
     def score(self, output: Sequence[Map], truth: Distances) -> Tensor:
-        """Return how near each of N outputs is to what is sought, (N,): over 0 where it is a success.
-
-        "nearer" and "farther" take the mean over pixels with its sign. "gone" is the lesser of the loss, and of how
-        far the share of the object's relief that is left lies under a half; see `_relief`.
-        """
+        """Return how near each of N outputs is to what is sought, (N,): over 0 where it is a success. "nearer" and
+        "farther" take the mean over pixels with its sign. "gone" is the lesser of the loss, and of how far the share of
+        the object's relief that is left lies under a half; see `_relief`."""
         if self.minimise or not self.seek:
-            loss = self.loss(output, truth)
-            return -loss if self.minimise else loss
+            return super().score(output, truth)
         if self.seek == "gone":
             return self._each(
                 output, truth, lambda f: torch.minimum(f.abs().mean() - self._bar, 0.5 - self._relief(f, truth))
@@ -302,9 +271,7 @@ class Depth(Task):
 
     def _judged(self, one: Map, truth: Distances) -> tuple[Tensor, bool]:
         """What the model says of every pixel, (H, W) z-depth as the truth has it, or its inverse; and which of the two.
-
-        A map is brought to the size of the picture as transformers does it in `post_process_depth_estimation`.
-        """
+        A map is brought to the size of the picture as transformers does it in `post_process_depth_estimation`."""
         ((said, values),) = one.items()
         kind = self.kind or said
         size = (truth.mask.shape[0], truth.mask.shape[1])
@@ -343,29 +310,26 @@ class Depth(Task):
     def said(self, output: Sequence[Map], truth: Distances, margins: Sequence[float]) -> list[Said]:
         """See `Task.said`; the payload has the factor by which the distance is off, what is left of the relief, and
         where scale and shift were found."""
-        each = zip(output, margins, strict=True)
-        return [self._said(one, truth, right=margin >= 0.0) for one, margin in each]
-
-    def _said(self, one: Map, truth: Distances, *, right: bool) -> Said:
         if not truth.seen:
-            return Prediction(OUT_OF_VIEW), None
-        factors = self._factors(one, truth)
-        mean, relief = float(factors.mean()), float(self._relief(factors, truth))
-        if not math.isfinite(mean):
-            return Prediction(NOT_A_NUMBER), None
+            return [(Prediction(OUT_OF_VIEW), None)] * len(output)
+        found: list[Said] = []
         distance = float(truth.z[truth.mask].double().log().mean().exp())
-        payload: dict[str, JsonValue] = {
-            "distance": round(distance, 4),
-            "judged": round(distance * math.exp(mean), 4),
-            "factor": round(math.exp(float(factors.abs().mean())), 4),
-            "relief": round(relief, 4),
-        }
-        if (self.kind or next(iter(one))) != METRIC:
-            payload["fitted"] = "beside the object" if truth.anchored else "in the whole picture"
-        holds = {"nearer": -mean > self._bar, "farther": mean > self._bar, "gone": relief < 0.5}
-        names = sorted(("gone", "nearer", "farther"), key=lambda name: name != self.seek)
-        wrong = next((LABELS[name] for name in names if holds[name]), OUT_OF_SHAPE)
-        return Prediction(AS_FAR if right else wrong), payload
+        for one, margin in zip(output, margins, strict=True):
+            factors = self._factors(one, truth)
+            mean, relief = float(factors.mean()), float(self._relief(factors, truth))
+            payload: dict[str, JsonValue] = {
+                "distance": round(distance, 4),
+                "judged": round(distance * math.exp(mean), 4),
+                "factor": round(math.exp(float(factors.abs().mean())), 4),
+                "relief": round(relief, 4),
+            }
+            if (self.kind or next(iter(one))) != METRIC:
+                payload["fitted"] = "beside the object" if truth.anchored else "in the whole picture"
+            holds = {"nearer": -mean > self._bar, "farther": mean > self._bar, "gone": relief < 0.5}
+            names = sorted(("gone", "nearer", "farther"), key=lambda name: name != self.seek)
+            wrong = next((LABELS[name] for name in names if holds[name]), OUT_OF_SHAPE)
+            found.append((Prediction(AS_FAR if margin >= 0.0 else wrong), payload))
+        return found
 
     def marks(self, output: Sequence[Map], truth: Distances) -> list[list[Mark]]:
         """See `Task.marks`: the object, its pixels of which the distance is right, and the disparity of everything."""
@@ -385,10 +349,8 @@ class Depth(Task):
 
 def _fitted(values: Tensor, wanted: Tensor, at: Tensor) -> Tensor:
     """Return a scale times the values (H, W) plus a shift, the nearest to what is wanted where `at` (H, W) says, by
-    least squares; there is a pixel there, and what is wanted is finite.
-
-    A scale is not negative: what the model holds for near stays near.
-    """
+    least squares; there is a pixel there, and what is wanted is finite. A scale is not negative: what the model holds
+    for near stays near."""
     x, y = values[at], wanted[at]
     x, y, middle, level = x - x.mean(), y - y.mean(), x.mean(), y.mean()
     scale = ((x * y).sum() / x.square().sum().clamp_min(1e-20)).clamp_min(0.0)

@@ -17,18 +17,17 @@ from torch import Tensor
 
 from advsearch.described import NOT_A_NUMBER, OUT_OF_VIEW
 from advsearch.errors import InputError
+from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.models.labels import names_nothing
 from advsearch.options import FROM_RUN
+from advsearch.tasks import detector_outputs as outputs
 from advsearch.tasks.base import Facts, Mark, Prediction, Said
 from advsearch.tasks.boxes import (
     FORMS,
-    HEADS,
     KNOWN,
-    LAYOUTS,
     SMALLEST,
     UNITS,
-    Box,
     Detections,
     Place,
     Reading,
@@ -44,16 +43,7 @@ from advsearch.tasks.boxes import (
     unit_in,
 )
 from advsearch.tasks.classification import NO, ClassTask, Labels
-from advsearch.tasks.detector_outputs import (
-    ORDERS,
-    QUERIES,
-    ask_order,
-    checked_order,
-    detections_in,
-    order_in,
-    settled,
-    told_by_classes,
-)
+from advsearch.tasks.detector_outputs import ASK_ORDER, HEADS, LAYOUTS, QUERIES, TOLD_BY_CLASSES
 
 GOALS = {
     "vanish": "no right box is found where the object is",
@@ -66,8 +56,7 @@ GOALS = {
 MOST, LEAST = 8, 0.1
 """Most boxes that are kept of a picture; the least score of one, and of one that is suppressed."""
 
-ELSEWHERE = "elsewhere"
-"""How a prediction says that a box is not where the object is."""
+ELSEWHERE = "elsewhere"  # how a prediction says that a box is not where the object is
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,14 +78,6 @@ class Detection(ClassTask):
             "channels last" after it; of DETR's "boxes logits", or "boxes logits nothing" where the last class is no
             thing; "" for what types and numbers show.
         seek: what an attack is after, one of `GOALS`.
-        input_size: (height, width) of the model's input in pixels.
-        seen_unit, seen_order: what the model's own outputs show; "" where they have not yet.
-        undecided: whether only numbers tell scores from classes in its outputs.
-        shape: (A, B) of an output that is read as a YOLO's head; None of others.
-        masks: whether mask coefficients stand in its outputs, which are left out.
-        told: whether its network says that its boxes are corners in pixels, as those of libraries do (`KNOWN`).
-        fills_with_nan: whether rows of NaN stand where nothing is found, and not for an output that is not a number.
-        doubts: what is odd about these.
 
     Raises:
         InputError: a value that is none of these.
@@ -112,22 +93,22 @@ class Detection(ClassTask):
     unit: str = ""
     order: str = ""
     seek: str = "vanish"
-    input_size: tuple[int, int] = field(default=(1, 1), metadata=FROM_RUN)
-    seen_unit: str = field(default="", metadata=FROM_RUN)
+    input_size: tuple[int, int] = field(default=(1, 1), metadata=FROM_RUN)  # of the model, (height, width) in pixels
+    seen_unit: str = field(default="", metadata=FROM_RUN)  # what the model's own outputs show; "" where not yet
     seen_order: str = field(default="", metadata=FROM_RUN)
-    undecided: bool = field(default=False, metadata=FROM_RUN)
-    shape: tuple[int, ...] | None = field(default=None, metadata=FROM_RUN)
-    masks: bool = field(default=False, metadata=FROM_RUN)
-    told: bool = field(default=False, metadata=FROM_RUN)
-    fills_with_nan: bool = field(default=False, metadata=FROM_RUN)
-    doubts: str = field(default="", metadata=FROM_RUN)
+    undecided: bool = field(default=False, metadata=FROM_RUN)  # only numbers tell scores from classes in its outputs
+    shape: tuple[int, ...] | None = field(default=None, metadata=FROM_RUN)  # (A, B) of what is read as a YOLO's head
+    masks: bool = field(default=False, metadata=FROM_RUN)  # mask coefficients stand in its outputs, and are left out
+    told: bool = field(default=False, metadata=FROM_RUN)  # its network says what its boxes are, see `KNOWN`
+    fills_with_nan: bool = field(default=False, metadata=FROM_RUN)  # a row of NaN says that nothing is found
+    doubts: str = field(default="", metadata=FROM_RUN)  # what is odd about its boxes
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_numbers(lambda value: 0.0 < value < 1.0, "a number between 0 and 1", "iou", "confidence")
         self.check_numbers(lambda value: 0.0 < value <= 1.0, "a number over 0, up to 1", "suppression")
         try:
-            checked_order(self.order or ORDERS[0])
+            outputs.checked_order(self.order or outputs.ORDERS[0])
         except ValueError as error:
             raise InputError(f"task detection: order: {error}") from None
         for name, known in (("boxes", ("", *FORMS)), ("unit", ("", *UNITS)), ("seek", tuple(GOALS))):
@@ -172,17 +153,22 @@ class Detection(ClassTask):
         last = any("logits" in one for one in output) and self.named and names_nothing(self.labels[-1])
         head = self._head or (QUERIES[1] if last else "")
         try:
-            order = order_in(output, len(self.labels) if self.named else None, head)
+            order = outputs.order_in(output, len(self.labels) if self.named else None, head)
         except ValueError as error:
             what = f"the model's output is {tuple(grids[0].shape)}: " if grids else ""
-            asked = f"; {ask_order()}" if any("either" in one for one in output) else ""
+            asked = f"; {ASK_ORDER}" if any("either" in one for one in output) else ""
             raise InputError(f"task detection: {what}{error}{asked}") from None
+        # mask coefficients stand beside the scores of a picture's boxes
+        masks = any("beside" in one and "raw" not in one for one in output)
+        if grids:
+            length = grids[0].shape[0 if order.endswith(LAYOUTS[0]) else 1]
+            masks |= length > len(self.labels) + next(start for head, start in HEADS.items() if order.startswith(head))
         found = replace(
             self,
             seen_order=order or self.seen_order,
             undecided=self.undecided or any("either" in one for one in output),
             shape=tuple(grids[0].shape) if grids else self.shape,
-            masks=self.masks or any(self._has_masks(one, order) for one in output),
+            masks=self.masks or masks,
         )
         boxed = found._boxed(output)
         return replace(
@@ -191,13 +177,6 @@ class Detection(ClassTask):
             fills_with_nan=self.fills_with_nan or any("blank" in one and len(one["boxes"]) for one in boxed),
         )
 
-    def _has_masks(self, one: Detections, order: str) -> bool:
-        """Whether what stands beside the scores of a picture's boxes are mask coefficients."""
-        if "raw" not in one:
-            return "beside" in one
-        length = one["raw"].shape[0 if order.endswith(LAYOUTS[0]) else 1]
-        return length > len(self.labels) + next(start for head, start in HEADS.items() if order.startswith(head))
-
     def _boxed(self, output: Sequence[Detections]) -> Sequence[Detections]:
         """What the model returned, with the boxes of YOLO's heads and the scores of DETR's found."""
         return self._settled(output) if any("raw" in one or "logits" in one for one in output) else output
@@ -205,7 +184,7 @@ class Detection(ClassTask):
     @property
     def ambiguities(self) -> str:
         if self.undecided and not (self.order or self.seen_order):
-            return f"order: expected what tells scores from classes, and no output of the model does; {ask_order()}"
+            return f"order: expected what tells scores from classes, and no output of the model does; {ASK_ORDER}"
         if not (self.unit or self.seen_unit):
             return (
                 "unit: expected the unit of the model's boxes, and it finds nothing in noise and in the clean scene "
@@ -233,27 +212,24 @@ class Detection(ClassTask):
 
     @property
     def _reading(self) -> Reading:
-        form = self.boxes or ("cxcywh" if told_by_classes(self._head or self.seen_order) else FORMS[0])
+        form = self.boxes or ("cxcywh" if (self._head or self.seen_order) in TOLD_BY_CLASSES else FORMS[0])
         return Reading(form, self.unit or self.seen_unit or UNITS[1], self.input_size)
 
     @property
     def _head(self) -> str:
-        """The head of `boxes.HEADS`, or the one of `QUERIES`, that `order` says; "" where it says none."""
-        order = " ".join(checked_order(self.order)) if self.order else ""
-        return order if told_by_classes(order) else ""
+        """The head of `HEADS`, or the one of `QUERIES`, that `order` says; "" where it says none."""
+        order = " ".join(outputs.checked_order(self.order)) if self.order else ""
+        return order if order in TOLD_BY_CLASSES else ""
 
     def seeking(self, objective: str) -> Detection:
         return replace(self, seek=objective) if objective in GOALS else self
 
     def read(self, prediction: Any, count: int) -> list[Detections]:
-        return detections_in(prediction, count, self.order)
+        return outputs.detections_in(prediction, count, self.order)
 
     def classes_in(self, output: Sequence[Detections]) -> int | None:
         scores = output[0].get("scores")
         return scores.shape[1] if scores is not None and scores.ndim == 2 else None
-
-    def check(self, facts: Facts) -> None:
-        self.right_classes(facts)
 
     def truth(self, facts: Facts) -> Place:
         height, width = facts.mask.shape
@@ -265,10 +241,8 @@ class Detection(ClassTask):
     # ---- scores -----------------------------------------------------------------------------------------------------
 
     def loss(self, output: Sequence[Detections], truth: Place) -> Tensor:
-        """Return how far the best right box stays below `confidence`, in log-odds, (N,).
-
-        Of `create`: how far the best box where nothing is stands above it.
-        """
+        """Return how far the best right box stays below `confidence`, in log-odds, (N,). Of `create`: how far the best
+        box where nothing is stands above it."""
         wrong = self._create if self.seek == "create" else self._vanish
         return self._each(output, truth, lambda one: wrong(self._left(one), truth))
 
@@ -298,9 +272,7 @@ class Detection(ClassTask):
 
     def _displace(self, one: Detections, truth: Place) -> Tensor:
         """The lesser of two: how far the best overlap of a box that counts is under `iou`, and that some box counts.
-
-        The first is in units in which a small step from `iou` is as long as one in log-odds.
-        """
+        The first is in units in which a small step from `iou` is as long as one in log-odds."""
         scores = self._of(one, truth.labels)
         sure = log_odds(best_of(scores)) - self._bar
         away = (self.iou - best_of(overlap_with(one, truth), scores >= self.confidence)) / (self.iou * (1.0 - self.iou))
@@ -322,7 +294,7 @@ class Detection(ClassTask):
     def _settled(self, output: Sequence[Detections]) -> list[Detections]:
         """What the model returned, with scores and classes told apart, boxes as they came."""
         try:
-            return [settled(one, self.seen_order, len(self.labels) or None) for one in output]
+            return [outputs.settled(one, self.seen_order, len(self.labels) or None) for one in output]
         except ValueError as error:
             raise InputError(f"task detection: {error}") from None
 
@@ -382,19 +354,28 @@ class Detection(ClassTask):
     def predictions(self, output: Sequence[Detections], count: int = 1) -> list[tuple[Prediction, ...]]:
         found = []
         for one in self._read(output):
-            said = [
-                Prediction(self.name_of(label), label, score) for _, label, score in self._listed(one, count, SMALLEST)
-            ]
-            found.append(tuple(said) or (Prediction(NOT_A_NUMBER if self._broken(one) else "nothing"),))
+            broken = self._broken(one)
+            boxes = [] if broken else listed(one, count, SMALLEST, self.suppression)
+            said = tuple(Prediction(self.name_of(label), label, score) for _, label, score in boxes)
+            found.append(said or (Prediction(NOT_A_NUMBER if broken else "nothing"),))
         return found
 
     def said(self, output: Sequence[Detections], truth: Place, margins: Sequence[float]) -> list[Said]:
         """See `Task.said`; the prediction is what the model says of the object, the payload its boxes in pixels."""
-        return [
-            (Prediction(NOT_A_NUMBER), None) if self._broken(one)
-            else (self._prediction(self._left(one), truth), self._payload(one, truth))
-            for one in self._read(output)
-        ]  # fmt: skip
+        height, width = truth.size
+        found: list[Said] = []
+        for one in self._read(output):
+            boxes: list[JsonValue] = [
+                {
+                    "box": [round(share * side, 1) for share, side in zip(box, [width, height] * 2, strict=True)],
+                    "label": self.name_of(label),
+                    "score": round(score, 3),
+                }
+                for box, label, score in listed(one, MOST, self._least, self.suppression)
+            ]
+            payload: JsonValue = {"box": None if truth.box is None else list(truth.box), "found": boxes}
+            found.append((self._prediction(self._left(one), truth), payload))
+        return found
 
     def _prediction(self, one: Detections, truth: Place) -> Prediction:
         """What a model says of the object, with the score of the box that says so."""
@@ -419,23 +400,6 @@ class Detection(ClassTask):
         label = int(one["labels"][place] if "labels" in one else (one["scores"][place] == score).nonzero()[0])
         return Prediction(form.format(self.name_of(label)), label if form == "{}" else None, score)
 
-    def _listed(self, one: Detections, count: int, least: float) -> list[tuple[Box, int, float]]:
-        """See `listed`; none of an output that is not a number."""
-        return [] if self._broken(one) else listed(one, count, least, self.suppression)
-
-    def _payload(self, one: Detections, truth: Place) -> Any:
-        """The true box, and what the model found, in pixels of the picture."""
-        height, width = truth.size
-        found = [
-            {
-                "box": [round(share * side, 1) for share, side in zip(box, [width, height] * 2, strict=True)],
-                "label": self.name_of(label),
-                "score": round(score, 3),
-            }
-            for box, label, score in self._listed(one, MOST, self._least)
-        ]
-        return {"box": None if truth.box is None else list(truth.box), "found": found}
-
     def marks(self, output: Sequence[Detections], truth: Place) -> list[list[Mark]]:
         """See `Task.marks`: the true box, and every box with a score of `confidence`."""
         height, width = truth.size
@@ -443,7 +407,8 @@ class Detection(ClassTask):
         return [
             true + [
                 Mark(f"{self.name_of(label)} {score:.2f}", False, box=(a * width, b * height, c * width, d * height))
-                for (a, b, c, d), label, score in self._listed(one, MOST, self.confidence)
+                for (a, b, c, d), label, score
+                in ([] if self._broken(one) else listed(one, MOST, self.confidence, self.suppression))
             ]
             for one in self._read(output)
         ]  # fmt: skip

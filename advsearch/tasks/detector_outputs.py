@@ -11,7 +11,7 @@ that only fill up are gone; how many of them were NaN throughout is said as `bla
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -19,19 +19,8 @@ import torch
 from torch import Tensor
 
 from advsearch.models.labels import sets_of
-from advsearch.models.model import each_tensor
-from advsearch.tasks.boxes import (
-    HEADS,
-    LAYOUTS,
-    TOLERANCE,
-    Detections,
-    as_option,
-    counted,
-    head_in,
-    names_head,
-    nowhere,
-    split,
-)
+from advsearch.models.model import tensors_in
+from advsearch.tasks.boxes import Detections, as_option, counted, nowhere
 
 EXPECTED = (
     "expected boxes (N, D, 4) and scores (N, D, classes); boxes (N, D, 4), labels (N, D) and scores (N, D); rows "
@@ -39,15 +28,27 @@ EXPECTED = (
     "each picture a mapping with boxes (D, 4), labels (D,) and scores (D,)"
 )
 
-ORDERS = ("boxes scores labels", "boxes labels scores")
-"""What two numbers of a box may be."""
+ORDERS = ("boxes scores labels", "boxes labels scores")  # what two numbers of a box may be
 
 QUERIES = ("boxes logits", "boxes logits nothing")
 """What DETR's networks return: logits that judge each class by itself, with a sigmoid (Zhu et al. 2021, section 4), or
 of which a softmax chooses one, the last of which stands for nothing (Carion et al. 2020, section 3.1)."""
 
-QUERY_LOGITS = ("pred_logits", "logits")
-"""What these are called where the boxes are `pred_boxes`."""
+QUERY_LOGITS = ("pred_logits", "logits")  # what these are called where the boxes are `pred_boxes`
+
+HEADS = {"boxes scores": 4, "boxes objectness scores": 5}
+"""What the numbers of a place of a YOLO's output are, and how many stand before the scores."""
+
+LAYOUTS = ("channels first", "channels last")
+OF_HEADS = frozenset([*HEADS, *(f"{head} {layout}" for head in HEADS for layout in LAYOUTS)])
+TOLD_BY_CLASSES = OF_HEADS | frozenset(QUERIES)
+"""Orders of outputs that the number of classes explains; their boxes have a middle and sides."""
+
+TOLERANCE = 1e-3  # how far outside [0, 1] a score may lie
+_WITH_ANGLE = f"boxes objectness scores {LAYOUTS[0]}"
+"""What a head of oriented boxes looks like: an angle after the scores makes as many numbers as objectness before."""
+
+_UNREAD = "which are not read"
 
 NAMES = {
     "boxes": ("boxes", "pred_boxes", "detection_boxes", "bboxes", "xyxy", "box", "bbox"),
@@ -59,24 +60,18 @@ NAMES = {
 WORDS = {"boxes": ("box",), "scores": ("score", "conf", "prob", "logit"), "labels": ("label", "class", "cls", "categ")}
 """What is in a name that is none of these."""
 
+ASK_ORDER = f"say {' or '.join(as_option(f'order: {order}') for order in ORDERS)}"
+"""What to say where scores and classes cannot be told apart."""
+
 NOTHING: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
 
 
-def told_by_classes(order: str) -> bool:
-    """Whether an order is of outputs that the number of classes explains; their boxes have a middle and sides."""
-    return names_head(order) or order in QUERIES
-
-
 def checked_order(text: str) -> tuple[str, ...]:
-    """Return the parts that an order names: boxes, scores and labels, and "batch" for the number of the picture.
-
-    Of one of YOLO's heads these are the words of `boxes.HEADS`, and of a layout; of DETR's one of `QUERIES`.
-
-    Raises:
-        ValueError: it names others.
-    """
+    """Return the parts that an order names: boxes, scores and labels, and "batch" for the number of the picture. Of one
+    of YOLO's heads these are the words of `HEADS`, and of a layout; of DETR's one of `QUERIES`. Raises ValueError: it
+    names others."""
     parts = tuple(text.replace(",", " ").split())
-    if told_by_classes(" ".join(parts)):
+    if " ".join(parts) in TOLD_BY_CLASSES:
         return parts
     if sorted(parts) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
         raise ValueError(
@@ -92,11 +87,8 @@ def detections_in(returned: Any, count: int, order: str = "") -> list[Detections
     have no names, see `checked_order`; "" for what types and shapes say. Raises ValueError: it is something else, or
     scores are not in [0, 1]."""
     parts = checked_order(order) if order else ()
-    if (
-        isinstance(returned, (list, tuple))
-        and returned
-        and all(isinstance(one, Tensor) and one.ndim > 3 for one in returned)
-    ):
+    listed = isinstance(returned, (list, tuple)) and len(returned) > 0
+    if listed and all(isinstance(one, Tensor) and one.ndim > 3 for one in returned):
         raise ValueError("expected boxes, and not the maps of a head from which they are made: export it in .eval()")
     if (queries := _queries(returned, " ".join(parts))) is not None:
         boxes, logits = queries
@@ -107,7 +99,7 @@ def detections_in(returned: Any, count: int, order: str = "") -> list[Detections
     beside = torch.tensor(sorted(channels), dtype=torch.long)
     grid = isinstance(returned, Tensor) and returned.ndim == 3 and returned.shape[0] == count and returned.shape[2] != 4
     masked = grid and returned.shape[2] - 6 in channels and bool((returned[..., 5] == returned[..., 5].round()).all())
-    if grid and (names_head(" ".join(parts)) or not (parts or masked or returned.shape[2] == 6)):
+    if grid and (" ".join(parts) in OF_HEADS or not (parts or masked or returned.shape[2] == 6)):
         return [{"raw": one.float(), "beside": beside} for one in returned]
     if masked:  # rows of a box, a score, a class and mask coefficients
         return [{**one, "beside": beside} for one in detections_in(returned[..., :6], count, order)]
@@ -116,7 +108,15 @@ def detections_in(returned: Any, count: int, order: str = "") -> list[Detections
     if isinstance(returned, (list, tuple)) and len(returned) == count and all(map(_is_one, returned)):
         found = [dict(NOTHING) if one is None else _parts(one, parts) for one in returned]
     elif isinstance(returned, Tensor) and returned.ndim == 2 and returned.shape[1] == 7:
-        found = [_parts(rows, [part for part in parts if part != "batch"]) for rows in _split(returned, count, parts)]
+        # rows of all pictures, with the number of the picture in the first column, or where the order says
+        before = parts[: parts.index("batch")] if "batch" in parts else ()
+        place = len(before) + 3 * ("boxes" in before)
+        numbers = returned.detach()[:, place]
+        if not bool(((numbers == numbers.round()) & (numbers >= -1) & (numbers < count)).all()):
+            raise ValueError(EXPECTED)
+        rows = torch.cat([returned[:, :place], returned[:, place + 1 :]], dim=1)
+        beside_number = [part for part in parts if part != "batch"]
+        found = [_parts(rows[numbers == number], beside_number) for number in range(count)]
     else:
         together = _parts(returned, parts)
         if together["boxes"].ndim == 2 and count == 1:  # the network has dropped the batch dimension
@@ -141,25 +141,17 @@ def _queries(returned: Any, order: str) -> tuple[Tensor, Tensor] | None:
 
 
 def _first(returned: Any) -> tuple[Any, set[int]]:
-    """The predictions of a YOLO's output, and how many channels the maps (N, K, h, w) have that came with them.
-
-    In training form they are the first of a tuple, feature maps and prototypes of masks stand beside them, in lists and
-    mappings too. Any other output is returned as it is.
-    """
+    """The predictions of a YOLO's output, and how many channels the maps (N, K, h, w) have that came with them. In
+    training form they are the first of a tuple, feature maps and prototypes of masks stand beside them, in lists and
+    mappings too. Any other output is returned as it is."""
     if not isinstance(returned, (list, tuple)) or not returned or not isinstance(returned[0], Tensor):
         return returned, set()
     first, others = returned[0], returned[1:]
     beside = any(isinstance(one, Tensor) and one.ndim < 4 for one in others)
     if first.ndim != 3 or first.shape[2] == 4 or beside:
         return returned, set()
-    channels = set[int]()
-
-    def keep(one: Tensor) -> Tensor:
-        channels.update(one.shape[1:2] if one.ndim == 4 and len(one) == len(first) else ())
-        return one
-
-    each_tensor(list(others), keep)
-    return first, channels
+    maps = [part for part in tensors_in(list(others)) if part.ndim == 4 and len(part) == len(first)]
+    return first, {part.shape[1] for part in maps}
 
 
 def _is_one(part: Any) -> bool:
@@ -169,33 +161,14 @@ def _is_one(part: Any) -> bool:
     return part is None or isinstance(part, (Mapping, list, tuple)) or _named(part) is not None
 
 
-def _split(rows: Tensor, count: int, order: Sequence[str]) -> list[Tensor]:
-    """Rows (K, 7) of all pictures as rows (D, 6) of each; the number of the picture comes first, or where it says."""
-    place = _columns(order)["batch"].start if "batch" in order else 0
-    numbers = rows.detach()[:, place]
-    if not bool(((numbers == numbers.round()) & (numbers >= -1) & (numbers < count)).all()):
-        raise ValueError(EXPECTED)
-    rest = torch.cat([rows[:, :place], rows[:, place + 1 :]], dim=1)
-    return [rest[numbers == number] for number in range(count)]
-
-
-def _columns(order: Sequence[str]) -> dict[str, slice]:
-    """Which columns of rows hold a part."""
-    found, begin = dict[str, slice](), 0
-    for part in order:
-        found[part] = slice(begin, begin + (4 if part == "boxes" else 1))
-        begin = found[part].stop
-    return found
-
-
 def _parts(returned: Any, order: Sequence[str]) -> dict[str, Tensor]:
     """Return the parts of an output by name: boxes, and scores, with labels or without, or `either`."""
     if isinstance(returned, Tensor):
         if returned.ndim not in (2, 3) or returned.shape[-1] != 6:
             raise ValueError(EXPECTED)
         if order:
-            columns = {part: returned[..., where] for part, where in _columns(order).items()}
-            return {name: part if name == "boxes" else part[..., 0] for name, part in columns.items()}
+            columns = returned.split([4 if name == "boxes" else 1 for name in order], dim=-1)
+            return {name: part if name == "boxes" else part[..., 0] for name, part in zip(order, columns, strict=True)}
         return {"boxes": returned[..., :4], "either": returned[..., 4:]}
     named = _named(returned)
     if named is not None and "boxes" in named and "scores" in named:
@@ -255,10 +228,8 @@ def _by_shape(tensors: Sequence[Tensor]) -> dict[str, Tensor]:
 
 
 def _one(one: Mapping[str, Tensor]) -> Detections:
-    """The detections of one picture, checked, without rows that only fill up.
-
-    Such a row has a class or score of -1, or four equal numbers or NaN for a box, and no score.
-    """
+    """The detections of one picture, checked, without rows that only fill up. Such a row has a class or score of -1, or
+    four equal numbers or NaN for a box, and no score."""
     boxes = one["boxes"].reshape(-1, 4) if one["boxes"].numel() == 0 else one["boxes"]
     parts = [part for name, part in one.items() if name != "blank"]
     if boxes.ndim != 2 or boxes.shape[1] != 4 or any(len(part) != len(boxes) for part in parts):
@@ -285,9 +256,7 @@ def _one(one: Mapping[str, Tensor]) -> Detections:
         raise ValueError(
             f"expected scores that are probabilities in [0, 1]; apply a sigmoid or a softmax to them{said}"
         )
-    found = {"boxes": boxes, "scores": scores} if labels is None else {
-        "boxes": boxes, "scores": scores, "labels": labels.long()
-    }  # fmt: skip
+    found = {"boxes": boxes, "scores": scores, **({} if labels is None else {"labels": labels.long()})}
     return {**_kept(found, filling, best), **{name: one[name] for name in one if name == "blank"}}
 
 
@@ -305,27 +274,25 @@ def _kept(one: dict[str, Tensor], filling: Tensor, numbers: Tensor) -> Detection
 
 def settled(one: Detections, order: str = "", classes: int | None = None) -> Detections:
     """Return the detections of a picture with boxes, scores and labels told apart, by an order (`ORDERS`, `QUERIES`, or
-    `boxes.HEADS` with a layout; "" for what its rows show) and the number of classes, None where nobody says. Raises
+    `HEADS` with a layout; "" for what its rows show) and the number of classes, None where nobody says. Raises
     ValueError: they do not show it, or something else than the order says."""
-    if "raw" in one:
+    if "raw" in one or "logits" in one:
         if classes is None:
             raise ValueError(EXPECTED)
         order = order or order_in([one], classes)
-        boxes, scores = split(one["raw"], classes, order)
+        if "raw" in one:
+            boxes, scores = split(one["raw"], classes, order)
+        else:
+            boxes, logits = one["boxes"], one["logits"]
+            scores = logits.softmax(dim=1)[:, :classes] if order == QUERIES[1] else logits.sigmoid()
         return _one({"boxes": boxes, "scores": scores})
-    if "logits" in one:
-        if classes is None:
-            raise ValueError(EXPECTED)
-        choose = (order or order_in([one], classes)) == QUERIES[1]
-        scores = one["logits"].softmax(dim=1)[:, :classes] if choose else one["logits"].sigmoid()
-        return _one({"boxes": one["boxes"], "scores": scores})
     if "either" not in one:
         return {name: part for name, part in one.items() if name != "beside"}
     rows = counted(one) | one["either"].isnan().any(dim=1)
     order = order or order_in([one], classes) or ("" if bool(rows.any()) else ORDERS[0])
     if not order:
-        raise ValueError(f"which of a box's two numbers is its score does not show; {ask_order()}")
-    if names_head(order):
+        raise ValueError(f"which of a box's two numbers is its score does not show; {ASK_ORDER}")
+    if order in OF_HEADS:
         scores = one["either"].prod(dim=1, keepdim=True) if "objectness" in order else one["either"]
         return _one({"boxes": one["boxes"], "scores": scores})
     first, second = one["either"].unbind(dim=1)
@@ -334,43 +301,29 @@ def settled(one: Detections, order: str = "", classes: int | None = None) -> Det
     return _one({**said, "scores": scores, "labels": labels})
 
 
-def _order_of_queries(logits: int, classes: int, said: str) -> str:
-    """Which of `QUERIES` has so many logits of a box; ValueError where none has."""
-    order = said or QUERIES[logits == classes + 1]
-    if logits in ((classes, classes + 1) if order == QUERIES[1] else (classes,)):
-        return order
-    fitting = [f"`labels={name}`" for name in dict.fromkeys([*sets_of(logits), *sets_of(logits - 1)])]
-    raise ValueError(
-        f"expected {classes} logits of a box for {classes} classes, or {classes + 1} with one for nothing, got "
-        f"{logits}; {' or '.join(fitting) + ' would fit' if fitting else 'give the `labels` of its classes'}"
-    )
-
-
-def ask_order() -> str:
-    """What to say where scores and classes cannot be told apart."""
-    return f"say {' or '.join(as_option(f'order: {order}') for order in ORDERS)}"
-
-
 def order_in(found: Sequence[Detections], classes: int | None = None, head: str = "") -> str:
-    """Return which order detections show; "" where they leave it open.
-
-    It is one of `ORDERS`, of `QUERIES`, or of `boxes.HEADS` with its layout.
+    """Return which order detections of any pictures show, one of `ORDERS`, of `QUERIES`, or of `HEADS` with its layout;
+    "" where they leave it open. Nobody may say how many classes there are; `head` is what is said of outputs in one
+    tensor, one of `HEADS` or of `QUERIES`, or "".
 
     A class is a whole number, a score lies in [0, 1]; and what suppression leaves comes by falling scores. Two numbers
     of which none is a class are the scores of two classes, or objectness and the score of the only one.
-
-    Args:
-        found: of any pictures.
-        classes: that there are; None where nobody says.
-        head: of `boxes.HEADS`, what is said of outputs in one tensor, or of `QUERIES`; "" for nothing.
 
     Raises:
         ValueError: no number can be a score, or none a class; or a grid of boxes has none or several of its orders; or
             there are more or fewer logits than classes.
     """
-    logits = {one["logits"].shape[1] for one in found if "logits" in one}
-    if logits and classes is not None:
-        return _order_of_queries(logits.pop(), classes, head)
+    sizes = [one["logits"].shape[1] for one in found if "logits" in one]
+    if sizes and classes is not None:
+        size = sizes[0]
+        order = head or QUERIES[size == classes + 1]
+        if size in ((classes, classes + 1) if order == QUERIES[1] else (classes,)):
+            return order
+        fitting = [f"`labels={name}`" for name in dict.fromkeys([*sets_of(size), *sets_of(size - 1)])]
+        raise ValueError(
+            f"expected {classes} logits of a box for {classes} classes, or {classes + 1} with one for nothing, got "
+            f"{size}; {' or '.join(fitting) + ' would fit' if fitting else 'give the `labels` of its classes'}"
+        )
     grids = [one for one in found if "raw" in one]
     if grids and classes is not None:
         heads = set.intersection(*(set(head_in(one["raw"], one["beside"].tolist(), classes, head)) for one in grids))
@@ -398,3 +351,65 @@ def order_in(found: Sequence[Detections], classes: int | None = None, head: str 
     if all(fits):
         fits = [all(bool((one[:, k].diff() <= 0.0).all()) for one in rows) for k in (0, 1)]
     return "" if fits[0] == fits[1] else ORDERS[0] if fits[0] else ORDERS[1]
+
+
+# ---- in one tensor, as YOLO's networks give them ---------------------------------------------------------------------
+# It is (A, B) for each picture: "channels first" (places are columns, v8 to v12 and YOLO11) or "channels last" (v5 to
+# v7, YOLOX, RT-DETR). The numbers of a place are a box (middle, width, height), in older ones objectness, with which
+# scores are multiplied, a score of each class, and mask coefficients.
+
+
+def head_in(returned: Tensor, beside: Collection[int], classes: int, order: str = "") -> tuple[str, ...]:
+    """Return the orders that an output (A, B) for one picture may have, such as "boxes scores channels first"; what is
+    said of it already narrows them. Sides tell (`beside`: the channels of maps that came with it), and scores, which
+    lie in [0, 1]. Raises ValueError where it has none of them; the text says what it seems to be."""
+    found, outside = list[str](), ""
+    for layout, length in zip(LAYOUTS, returned.shape, strict=True):
+        for head, start in HEADS.items():
+            name, masks = f"{head} {layout}", length - start - classes
+            if order not in ("", head, name) or (masks and masks not in beside):
+                continue
+            scores = split(returned, classes, name, multiplied=False)[1].detach()
+            far = (scores < -TOLERANCE) | (scores > 1.0 + TOLERANCE)
+            if not bool((far & scores.isfinite()).any()):
+                found.append(name)
+            elif name == _WITH_ANGLE and not bool(far[:, :-1].any()):
+                outside = f"an angle after the scores, as OBB heads have it, {_UNREAD}"
+            else:
+                outside = outside or (
+                    f"scores from {float(scores.min()):.3g} to {float(scores.max()):.3g} if it is read as '{name}'; "
+                    "expected probabilities in [0, 1]: apply a sigmoid to them"
+                )
+    if found == [_WITH_ANGLE] and not order:
+        raise ValueError(
+            f"its {5 + classes} channels may be those of an OBB head (with an angle), {_UNREAD}; if it has "
+            f"objectness, say `task='detection={{order: {_WITH_ANGLE}}}'`"
+        )
+    if outside and not found:
+        raise ValueError(f"it has {outside}")
+    if found:
+        return tuple(found)
+    size, last = min(returned.shape), returned.shape[0] >= returned.shape[1]
+    over = {size - 4 - classes, size - 6 if last else 0}
+    advice = "; give the `labels` of the model's classes"
+    if named := [f"`labels={name}`" for start in HEADS.values() for name in sets_of(size - start)]:
+        advice = f"; {' or '.join(named)} would fit"
+    elif 1 in over:
+        advice = f", as OBB heads (oriented boxes, with an angle) have it, {_UNREAD}"
+    elif 32 in over:
+        advice = ", as with mask coefficients, and no prototypes (N, 32, h, w) came beside them"
+    elif any(more > 0 and more % 3 == 0 for more in over):
+        advice = f", as pose heads (with keypoints) have it, {_UNREAD}; or give the `labels` of the model's classes"
+    of = f"{classes} class{'es' * (classes > 1)}"
+    raise ValueError(f"expected 4 + {classes} or 5 + {classes} numbers of a box for {of}, got {size}{advice}")
+
+
+def split(returned: Tensor, classes: int, order: str, *, multiplied: bool = True) -> tuple[Tensor, Tensor]:
+    """Return the boxes (D, 4) and scores (D, classes) of an output (A, B) for one picture; differentiable. Its order
+    has a layout. Unless objectness is `multiplied` with the scores, it is the first of (D, 1 + classes)."""
+    places = returned.T if order.endswith(LAYOUTS[0]) else returned
+    scores = places[:, 4 : 4 + classes]
+    if order.startswith("boxes objectness"):
+        objectness, scores = places[:, 4:5], places[:, 5 : 5 + classes]
+        scores = objectness * scores if multiplied else torch.cat([objectness, scores], dim=1)
+    return places[:, :4], scores

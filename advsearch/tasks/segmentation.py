@@ -29,10 +29,8 @@ class Region:
     mask: Tensor
 
     def at(self, size: tuple[int, int]) -> Tensor:
-        """Return the mask at the size of an output, (h, w) bool: a pixel of which at least half is the object's.
-
-        Where none is, those that have a part of it.
-        """
+        """Return the mask at the size of an output, (h, w) bool: a pixel of which at least half is the object's. Where
+        none is, those that have a part of it."""
         if self.mask.shape == size:
             return self.mask
         shares = F.interpolate(self.mask[None, None].float(), size=size, mode="area")[0, 0]
@@ -44,13 +42,8 @@ class Region:
 class Segmentation(ClassTask):
     """A model gives at least `accuracy` of the object's pixels a right class. Pixels beside the object don't count.
 
-    Where the object is not seen at all there is nothing to segment, and every prediction is right.
-
-    Args:
-        accuracy: least share of the object's pixels.
-
-    Raises:
-        InputError: no share between 0 and 1.
+    Where the object is not seen at all there is nothing to segment, and every prediction is right. Raises InputError:
+    `accuracy` is no share between 0 and 1.
     """
 
     name = "segmentation"
@@ -64,11 +57,7 @@ class Segmentation(ClassTask):
         self.check_numbers(lambda value: 0.0 < value <= 1.0, "a number over 0, up to 1", "accuracy")
 
     def read(self, returned: Any, count: int) -> Tensor:
-        """Return the logits (N, classes, h, w) in what a network returned.
-
-        Raises:
-            ValueError: there are none.
-        """
+        """Return the logits (N, classes, h, w) in what a network returned. Raises ValueError: there are none."""
         if isinstance(returned, Mapping):
             returned = returned.get("out", returned.get("logits"))
         elif hasattr(returned, "logits"):
@@ -82,9 +71,6 @@ class Segmentation(ClassTask):
     def classes_in(self, output: Tensor) -> int:
         return output.shape[1]
 
-    def check(self, facts: Facts) -> None:
-        self.right_classes(facts)
-
     def truth(self, facts: Facts) -> Region:
         return Region(self.right_classes(facts), facts.mask)
 
@@ -92,27 +78,22 @@ class Segmentation(ClassTask):
         return self.names(truth.labels)
 
     def loss(self, output: Tensor, truth: Region) -> Tensor:
-        """Return, in logits (N,), the wrong classes' lead at the pixel that decides: over 0 where too few are right.
-
-        Of the object's pixels in the order of that lead it is the one at which `accuracy` of them is reached.
-        """
+        """Return, in logits (N,), the wrong classes' lead at the pixel that decides: over 0 where too few are right. Of
+        the object's pixels in the order of that lead it is the one at which `accuracy` of them is reached."""
         return self._deciding(output, truth, wrong_lead, truth.labels)
 
     def score(self, output: Tensor, truth: Region) -> Tensor:
         """See `Task.score`; with a target, enough of the object's pixels have to be given that."""
         if self.target is None:
-            loss = self.loss(output, truth)
-            return -loss if self.minimise else loss
+            return super().score(output, truth)
         return -self._deciding(output, truth, lambda logits, labels: -target_lead(logits, labels), self.target)
 
     def pixel_margin(self, output: Tensor, truth: Region) -> Tensor:
-        """Return the mean over the object's pixels of what is sought: the lead of wrong classes, or of the target's.
-
-        In logits, (N,). Every pixel has a derivative, and not the deciding one alone as in `loss`.
-        """
+        """Return the mean over the object's pixels of what is sought: the lead of wrong classes, or of the target's. In
+        logits, (N,). Every pixel has a derivative, and not the deciding one alone as in `loss`."""
         pixels = self._pixels(output, truth)
         if pixels is None:
-            return self._unseen(output)
+            return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0
         lead = wrong_lead(pixels, truth.labels) if self.target is None else target_lead(pixels, self.target)
         mean = lead.reshape(len(output), -1).mean(dim=1)
         return -mean if self.minimise else mean
@@ -121,7 +102,7 @@ class Segmentation(ClassTask):
         """The lead at the pixel at which `accuracy` of them is reached, (N,)."""
         pixels = self._pixels(output, truth)
         if pixels is None:
-            return self._unseen(output)
+            return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0
         values = lead(pixels, labels).reshape(len(output), -1)
         deciding = values.kthvalue(math.ceil(self.accuracy * values.shape[1]), dim=1).values
         return torch.where(values.isfinite().all(dim=1), deciding, math.nan)
@@ -132,10 +113,6 @@ class Segmentation(ClassTask):
         mask = truth.at((output.shape[2], output.shape[3])).to(output.device)
         chosen = output.permute(0, 2, 3, 1)[:, mask]
         return chosen.reshape(-1, output.shape[1]) if chosen.shape[1] else None
-
-    @staticmethod
-    def _unseen(output: Tensor) -> Tensor:
-        return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0
 
     def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:
         """Return the things that most pixels of each picture are given, with the shares that they have."""
@@ -151,32 +128,26 @@ class Segmentation(ClassTask):
         return found
 
     def said(self, output: Tensor, truth: Region, margins: Sequence[float]) -> list[Said]:
-        """See `Task.said`.
-
-        The prediction is the class of most of the object's pixels; a wrong one where too few are right, and "no bottle"
-        where most of these are background. Its probability is the share of the object's pixels that are right.
-        """
-        each = zip(output, margins, strict=True)
-        return [self._said(one, truth, right=margin >= 0.0) for one, margin in each]
-
-    def _said(self, logits: Tensor, truth: Region, *, right: bool) -> Said:
-        """The prediction of one picture, and what else is kept: shares of the object's pixels by class, and the
-        overlap."""
-        pixels = self._pixels(logits[None], truth)
-        if pixels is None:
-            return Prediction(OUT_OF_VIEW), None
-        correct = members(pixels, truth.labels)
-        hits = self._correct(logits, truth)
-        mask = truth.at((logits.shape[1], logits.shape[2])).to(hits.device)
-        counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
-        first = int(counts.masked_fill(correct != right, -1).argmax())
-        accuracy = float(hits[mask].float().mean())
-        shares = {self.name_of(i): round(n / len(pixels), 4) for i, n in enumerate(counts.tolist()) if n}
-        payload = {"accuracy": round(accuracy, 4), "iou": round(float((hits & mask).sum() / (hits | mask).sum()), 4)}
-        said = Prediction(self.name_of(first), first, accuracy)
-        if not right and first in self.nothing:
-            said = Prediction(f"{NO}{self.name_of(truth.labels[0])}", None, accuracy)
-        return said, {**payload, "pixels": shares}
+        """See `Task.said`. The prediction is the class of most of the object's pixels; a wrong one where too few are
+        right, and "no bottle" where most of these are background. Its probability is the share of the object's pixels
+        that are right. Beside it stand shares of these by class, and the overlap."""
+        found: list[Said] = []
+        mask = truth.at((output.shape[2], output.shape[3])).to(output.device)
+        for logits, margin in zip(output, margins, strict=True):
+            pixels = self._pixels(logits[None], truth)
+            if pixels is None:
+                found.append((Prediction(OUT_OF_VIEW), None))
+                continue
+            right, hits = margin >= 0.0, self._correct(logits, truth)
+            counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
+            first = int(counts.masked_fill(members(pixels, truth.labels) != right, -1).argmax())
+            accuracy, overlap = float(hits[mask].float().mean()), float((hits & mask).sum() / (hits | mask).sum())
+            said = Prediction(self.name_of(first), first, accuracy)
+            if not right and first in self.nothing:
+                said = Prediction(f"{NO}{self.name_of(truth.labels[0])}", None, accuracy)
+            shares = {self.name_of(i): round(n / len(pixels), 4) for i, n in enumerate(counts.tolist()) if n}
+            found.append((said, {"accuracy": round(accuracy, 4), "iou": round(overlap, 4), "pixels": shares}))
+        return found
 
     @staticmethod
     def _correct(logits: Tensor, truth: Region) -> Tensor:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -27,106 +26,72 @@ from advsearch.pictures import upright
 from advsearch.tasks.base import Facts, Judgement
 from advsearch.tasks.classification import Classification, Labels
 
-MOST = 10_000
-"""Pictures of a gallery, before `advsearch.files.scaled`."""
-
-SIDE = 1024
-"""Longest side in pixels of a picture as it is kept; larger ones are averaged down."""
-
-AT_ONCE = 16
-"""Pictures that a network is shown at once."""
-
-PENALTY = 1e-3
-"""Of the squared weights of a linear head, beside a mean cross-entropy in nats."""
-
-ROUNDS = 500
-"""Most iterations of the fit of a linear head; it usually stands still after a few dozen."""
+MOST = 10_000  # pictures of a gallery, before `advsearch.files.scaled`
+SIDE = 1024  # longest side in pixels of a picture as it is kept; larger ones are averaged down
+AT_ONCE = 16  # pictures that a network is shown at once
+PENALTY = 1e-3  # of the squared weights of a linear head, beside a mean cross-entropy in nats
+ROUNDS = 500  # most iterations of the fit of a linear head; it usually stands still after a few dozen
 
 
 @dataclass(frozen=True, eq=False)
 class Gallery:
-    """Reference pictures, embedded.
+    """Reference pictures, embedded."""
 
-    Attributes:
-        names: of the folders, in order.
-        owners: (R,) whole numbers, the number of each picture's name.
-        paths: of each picture, within the folder.
-        features: (R, D), of length 1.
-        seen_by: the network and its preprocessing.
-        head: weights (names, D) and biases (names,) of a linear head; None where none was fitted.
-    """
-
-    names: tuple[str, ...]
-    owners: Tensor
-    paths: tuple[str, ...]
-    features: Tensor
-    seen_by: tuple[Any, ...] = field(repr=False)
-    head: tuple[Tensor, Tensor] | None = field(default=None, repr=False)
+    names: tuple[str, ...]  # of the folders, in order
+    owners: Tensor  # (R,) whole numbers, the number of each picture's name
+    paths: tuple[str, ...]  # of each picture, within the folder
+    features: Tensor  # (R, D), of length 1
+    seen_by: tuple[Any, ...] = field(repr=False)  # the network and its preprocessing
+    head: tuple[Tensor, Tensor] | None = field(default=None, repr=False)  # weights (names, D) and biases (names,)
 
     def cosines(self, features: Tensor) -> Tensor:
         """Return the cosine (N, R) of features (N, D) of length 1 and each picture."""
         return features @ self.features.to(features).T
-
-    def nearest(self, features: Tensor, k: int) -> Tensor:
-        """Return the mean cosine (N, names) of the k nearest pictures of each name, or of all where it has fewer."""
-        cosines = self.cosines(features)
-        each = (cosines[:, (self.owners == name).to(cosines.device)] for name in range(len(self.names)))
-        return torch.stack([own.topk(min(k, own.shape[1]), dim=1).values.mean(dim=1) for own in each], dim=1)
-
-    def linear(self, features: Tensor) -> Tensor:
-        """Return the logits (N, names) of the head."""
-        assert self.head is not None
-        weights, biases = self.head
-        return functional.linear(features, weights.to(features), biases.to(features))
 
 
 def folders_of(folder: str) -> list[tuple[str, Path]]:
     """Return the names in a folder, and the folder of each, in alphabetical order; hidden ones are left out. Raises
     InputError where it is not there, or does not have two names."""
     root = Path(folder).expanduser()
-    found = [(one.name, one) for one in _listed(root) if one.is_dir()]
-    if len(found) < 2:
-        got = f"only {found[0][0]}" if found else "no folder"
+    folders = [(entry.name, entry) for entry in _listed(root) if entry.is_dir()]
+    if len(folders) < 2:
+        got = f"only {folders[0][0]}" if folders else "no folder"
         raise InputError(
             f"references: expected two folders of pictures at least in {root}, each called by its name, such as mug "
             f"and bowl, got {got}"
         )
-    return found
+    return folders
 
 
 def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
-    """Return the pictures in a folder as a model sees them; everything is done anew, and the same each time.
+    """Return the pictures in a folder, which has one for each name, as a model that returns features sees them;
+    everything is done anew, and the same each time. A head is fitted where it is `linear`.
 
     A picture is turned upright, its middle is cut to the shape of the model's input, and then it goes the way of a
     rendered one.
-
-    Args:
-        folder: with a folder of pictures for each name.
-        model: that returns features (N, D).
-        linear: whether a head is fitted.
 
     Raises:
         InputError: as for `folders_of`; a name without a picture; too many pictures; features that are not (N, D).
         FileFormatError: a file that is no picture, or a huge one.
     """
-    names = folders_of(folder)
-    root = Path(folder).expanduser()
+    folders, root = folders_of(folder), Path(folder).expanduser()
     paths: list[tuple[int, Path]] = []
-    for number, (_, where) in enumerate(names):
-        found = _listed(where)
-        if not found:
-            raise InputError(f"references: expected pictures of {where.name} in {where}, got none; put some there")
-        paths += [(number, one) for one in found]
+    for number, (name, where) in enumerate(folders):
+        pictures = _listed(where)
+        if not pictures:
+            raise InputError(f"references: expected pictures of {name} in {where}, got none; put some there")
+        paths += [(number, picture) for picture in pictures]
     if len(paths) > files.scaled(MOST):
         raise files.too_large(root, f"at most {files.scaled(MOST):,} reference pictures", f"{len(paths):,}")
+    parts: list[Tensor] = []
+    shown = (_cut(torch.from_numpy(upright(path, SIDE)), model.input_size) for _, path in paths)
     with torch.no_grad():
-        shown = (_cut(torch.from_numpy(upright(one, SIDE)), model.input_size) for _, one in paths)
-        parts = []
-        for batch in _batches(shown):
-            parts.append(model(batch))
-            if parts[-1].dim() != 2:
-                got = tuple(parts[-1].shape)
-                raise InputError(f"model {model.name}: expected features (N, D), got {got}; use another task")
+        for _, of_one_size in itertools.groupby(shown, key=lambda picture: picture.shape):
+            while batch := list(itertools.islice(of_one_size, AT_ONCE)):
+                parts.append(model(torch.stack(batch)))
+                if parts[-1].dim() != 2:
+                    got = tuple(parts[-1].shape)
+                    raise InputError(f"model {model.name}: expected features (N, D), got {got}; use another task")
     features = torch.cat(parts)
     broken = ~features.isfinite().all(dim=1)
     if bool(broken.any()):
@@ -134,29 +99,21 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
     features = functional.normalize(features, dim=1)
     owners = torch.tensor([number for number, _ in paths])
     return Gallery(
-        tuple(name for name, _ in names),
+        tuple(name for name, _ in folders),
         owners,
-        tuple(one.relative_to(root).as_posix() for _, one in paths),
+        tuple(path.relative_to(root).as_posix() for _, path in paths),
         features,
-        seen_by(model),
+        (model.module, model.preprocessing),
         fitted(features, owners) if linear else None,
     )
 
 
-def seen_by(model: Model) -> tuple[Any, ...]:
-    """Return what decides how a model sees a picture."""
-    return model.module, model.preprocessing
-
-
 def fitted(features: Tensor, owners: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weights (names, D) and biases (names,) of a multinomial logistic regression.
+    """Return weights (names, D) and biases (names,) of a multinomial logistic regression on features (R, D) and the
+    numbers of their names (R,).
 
     Names count alike, however many pictures they have. The loss is convex, so its minimum is the only one; it is
     sought by L-BFGS from zero in double precision, as Radford et al. 2021 (arXiv 2103.00020, section A.3) fit theirs.
-
-    Args:
-        features: (R, D).
-        owners: (R,) whole numbers, the name of each.
     """
     count = int(owners.max()) + 1
     shares = 1.0 / (count * torch.bincount(owners, minlength=count).double()[owners])
@@ -200,15 +157,7 @@ def _cut(picture: Tensor, size: tuple[int, int]) -> Tensor:
     return picture[top : top + high, left : left + wide]
 
 
-def _batches(pictures: Iterator[Tensor]) -> Iterator[Tensor]:
-    """Yield pictures of one size that follow each other as (N, H, W, 3), at most `AT_ONCE`."""
-    for _, alike in itertools.groupby(pictures, key=lambda one: one.shape):
-        while batch := list(itertools.islice(alike, AT_ONCE)):
-            yield torch.stack(batch)
-
-
-METHODS = ("nearest", "linear")
-"""How features become logits."""
+METHODS = ("nearest", "linear")  # how features become logits
 
 TEMPERATURE = 0.07
 """What cosines are divided by to be logits (Wu et al. 2018, arXiv 1805.01978, section 4.1; Caron et al. 2021, arXiv
@@ -238,8 +187,6 @@ class Similarity(Classification):
         method: one of `METHODS`.
         k: how many of the nearest.
         threshold: cosine from which on a picture is the same as the clean one; None where there are references.
-        gallery: the references as the model sees them.
-        clean: (D,) features of the clean picture, of length 1; None before it was seen.
 
     Raises:
         InputError: a value out of range, or options that exclude each other.
@@ -254,7 +201,7 @@ class Similarity(Classification):
     k: int = 1
     threshold: float | None = None
     gallery: Gallery | None = field(default=None, compare=False, repr=False, metadata=FROM_RUN)
-    clean: Tensor | None = field(default=None, compare=False, repr=False, metadata=FROM_RUN)
+    clean: Tensor | None = field(default=None, compare=False, repr=False, metadata=FROM_RUN)  # (D,), of length 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -270,11 +217,8 @@ class Similarity(Classification):
                 raise InputError("task similarity: threshold: compares with the clean picture; leave `references` out")
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Similarity:
-        """See `Task.on`; references are read and shown to the model, once.
-
-        Raises:
-            InputError, FileFormatError: as for `gallery.embedded`; neither references nor a threshold.
-        """
+        """See `Task.on`; references are read and shown to the model, once. Raises InputError, FileFormatError: as for
+        `gallery.embedded`; neither references nor a threshold."""
         if not self.references and self.threshold is None:
             raise InputError(
                 "task similarity: references: expected a folder with a folder of pictures for each name, or a "
@@ -284,7 +228,8 @@ class Similarity(Classification):
         if target is not None and not self.references:
             raise InputError("target: a `threshold` knows no names; give `references` to task similarity")
         found = super().on(model, target=target, minimise=minimise)
-        if not self.references or (self.gallery is not None and self.gallery.seen_by == seen_by(model)):
+        seen = self.gallery is not None and self.gallery.seen_by == (model.module, model.preprocessing)
+        if seen or not self.references:
             return found
         return replace(found, gallery=embedded(self.references, model, linear=self.method == "linear"))
 
@@ -307,10 +252,8 @@ class Similarity(Classification):
         return replace(self, clean=functional.normalize(output.detach().float(), dim=1)[0]) if self.calibrates else self
 
     def read(self, returned: Any, count: int) -> Tensor:
-        """Return features (count, D): a tensor, the first of a tuple, or the first of `PARTS` that is there.
-
-        Of `last_hidden_state` that is the first token (CLS); a map is averaged over its positions.
-        """
+        """Return features (count, D): a tensor, the first of a tuple, or the first of `PARTS` that is there. Of
+        `last_hidden_state` that is the first token (CLS); a map is averaged over its positions."""
         found = pooled(returned[0] if type(returned) in (tuple, list) and returned else returned, token=True)
         if found is None or found.dim() != 2 or found.shape[0] != count:
             raise ValueError(f"expected features ({count}, D), or what has one of {', '.join(PARTS)}")
@@ -325,9 +268,13 @@ class Similarity(Classification):
             cosine = features @ self.clean.to(features)
             scores = torch.stack([cosine, torch.full_like(cosine, self.threshold)], dim=1)
         elif self.method == "linear":
-            return self.gallery.linear(features)
+            assert self.gallery.head is not None
+            return functional.linear(features, *(part.to(features) for part in self.gallery.head))
         else:
-            scores = self.gallery.nearest(features, self.k)
+            cosines, owners = self.gallery.cosines(features), self.gallery.owners.to(features.device)
+            each = [cosines[:, owners == name] for name in range(len(self.gallery.names))]
+            nearest = [of_name.topk(min(self.k, of_name.shape[1]), dim=1).values for of_name in each]
+            scores = torch.stack([of_name.mean(dim=1) for of_name in nearest], dim=1)
         return scores / TEMPERATURE
 
     def as_logits(self, output: Tensor, truth: Labels) -> Tensor:
@@ -348,11 +295,9 @@ class Similarity(Classification):
         ]
 
     def _ranked(self, gallery: Gallery, features: Tensor, logits: Tensor, truth: Labels) -> list[dict[str, JsonValue]]:
-        """Say of each of N pictures where the right one stands.
-
-        Each has the `rank` of the nearest right reference among all (1 where it is the nearest of all) and its
-        `cosine`; `name_rank`, that of the right name by its logit; and the `nearest` reference of all and its cosine.
-        """
+        """Say of each of N pictures where the right one stands. Each has the `rank` of the nearest right reference
+        among all (1 where it is the nearest of all) and its `cosine`; `name_rank`, that of the right name by its logit;
+        and the `nearest` reference of all and its cosine."""
         cosines = gallery.cosines(features)
         inside = torch.isin(gallery.owners, torch.tensor(truth)).to(cosines.device)
         best = cosines[:, inside].amax(dim=1)

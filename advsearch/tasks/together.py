@@ -4,8 +4,10 @@ of a rig of cameras."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain, cycle
 from typing import Any, final
 
 import torch
@@ -13,15 +15,15 @@ from torch import Tensor
 
 from advsearch.described import OUT_OF_VIEW
 from advsearch.errors import InputError
+from advsearch.files import JsonValue
 from advsearch.models import Model, Preprocessing
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.model import joined
 from advsearch.options import FROM_RUN, JOINED
-from advsearch.tasks.base import Facts, Judgement, Mark, Output, Prediction, Task, Truth, mean
+from advsearch.tasks.base import Facts, Judgement, Mark, Output, Prediction, Said, Task, Truth, mean
 from advsearch.tasks.command import Command
 
-Outputs = tuple[Any, ...]
-"""What each of several models returns for one picture, or one model for each picture of a rig."""
+Outputs = tuple[Any, ...]  # what each of several models returns for one picture, or one model for each picture of a rig
 
 
 @final
@@ -64,29 +66,69 @@ Truths = tuple[Truth, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Together(Task):
+class Joined(Task):
+    """A task made of others, which are the `judges`: one for each of its truths in their order, or one for all."""
+
+    varies = True
+
+    @property
+    @abstractmethod
+    def judges(self) -> tuple[Any, ...]:
+        """The tasks, on their models."""
+
+    @property
+    def calibrates(self) -> bool:
+        return any(judge.calibrates for judge in self.judges)
+
+    @property
+    def ambiguities(self) -> str:
+        return "; ".join(judge.ambiguities for judge in self.judges if judge.ambiguities)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        return _distinct(judge.remarks for judge in self.judges)
+
+    @property
+    def target_names(self) -> tuple[str, ...]:
+        return _distinct(judge.target_names for judge in self.judges)
+
+    def truth_names(self, truth: Any) -> tuple[str, ...]:
+        truths = truth.values() if isinstance(truth, Mapping) else truth
+        each = zip(cycle(self.judges), truths, strict=False)
+        return _distinct(judge.truth_names(true) for judge, true in each)
+
+
+def _distinct(texts: Iterable[Iterable[str]]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(chain.from_iterable(texts)))
+
+
+def all_said(predictions: Iterable[Prediction]) -> Prediction:
+    """Return several predictions as one, in words."""
+    return Prediction("; ".join(prediction.label for prediction in predictions))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Together(Joined):
     """Several models, each of which judges by a task and labels of its own.
 
     A prediction is right where all models are right, and a success where it is one for every model. So the loss is
     the largest of the models' losses, and the score the least of their scores.
-
-    Args:
-        parts: the task of each model, in the order of the outputs of `advsearch.tasks.together.together`.
-        models: that are asked.
-        tasks: the parts on these, by `on`.
     """
 
     name = "ensemble"
     objective = "each"
-    varies = True
 
-    parts: tuple[Task, ...]
-    models: tuple[Model, ...] = field(default=(), metadata=FROM_RUN)
-    tasks: tuple[Task, ...] = field(default=(), metadata=FROM_RUN)
+    parts: tuple[Task, ...]  # of each model, in the order of the outputs of `together`
+    models: tuple[Model, ...] = field(default=(), metadata=FROM_RUN)  # that are asked
+    tasks: tuple[Task, ...] = field(default=(), metadata=FROM_RUN)  # the parts on these
+
+    @property
+    def judges(self) -> tuple[Task, ...]:
+        return self.tasks
 
     @property
     def title(self) -> str:
-        names = [one.title for one in self.parts]
+        names = [part.title for part in self.parts]
         return JOINED.join(names) if len(set(names)) > 1 else self.name
 
     def read(self, returned: Any, count: int) -> list[Outputs]:
@@ -98,17 +140,15 @@ class Together(Task):
         models = model.module.models if isinstance(model.module, Ensemble) else ()
         if len(models) != len(self.parts):
             raise InputError(f"model: expected {len(self.parts)}, one for each task, got {len(models) or 1}")
-        pairs = list(zip(self.parts, models, strict=True))
-        takes = [self._takes_label(part) for part in self.parts]
         tasks = tuple(
-            part.on(one, target=target if label else None, minimise=minimise)
-            for (part, one), label in zip(pairs, takes, strict=True)
+            part.on(network, target=target if self._takes_label(part) else None, minimise=minimise)
+            for part, network in zip(self.parts, models, strict=True)
         )
-        wanted = None if target is None else tuple(one.target for one in tasks)
-        return replace(self, models=models, tasks=tasks, target=wanted, minimise=minimise)
+        targets = None if target is None else tuple(task.target for task in tasks)
+        return replace(self, models=models, tasks=tasks, target=targets, minimise=minimise)
 
     def seeking(self, objective: str) -> Together:
-        return replace(self, parts=tuple(one.seeking(objective) for one in self.parts))
+        return replace(self, parts=tuple(part.seeking(objective) for part in self.parts))
 
     def told(self, one: Task, facts: Facts) -> Facts:
         """Return the facts for one of the tasks: without a label that is for others."""
@@ -118,74 +158,53 @@ class Together(Task):
         return one.labelled or not any(part.labelled for part in self.parts)
 
     def check(self, facts: Facts) -> None:
-        for one in self.tasks:
-            one.check(self.told(one, facts))
-
-    @property
-    def calibrates(self) -> bool:
-        return any(one.calibrates for one in self.tasks)
+        for task in self.tasks:
+            task.check(self.told(task, facts))
 
     def after_calibration(self, output: Sequence[Outputs], truth: Truths | None) -> Together:
         each = zip(self.tasks, of_each(output), truth or [None] * len(self.tasks), strict=True)
-        return replace(self, tasks=tuple(one.after_calibration(own, true) for one, own, true in each))
+        return replace(self, tasks=tuple(task.after_calibration(*shown) for task, *shown in each))
 
     @property
     def ambiguities(self) -> str:
         pairs = zip(self.models, self.tasks, strict=True)
-        return "; ".join(f"{model.name}: {one.ambiguities}" for model, one in pairs if one.ambiguities)
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(remark for one in self.tasks for remark in one.remarks))
+        return "; ".join(f"{model.name}: {task.ambiguities}" for model, task in pairs if task.ambiguities)
 
     def truth(self, facts: Facts) -> Truths:
-        return tuple(one.truth(facts) for one in self.tasks)
-
-    def truth_names(self, truth: Truths) -> tuple[str, ...]:
-        pairs = zip(self.tasks, truth, strict=True)
-        return tuple(dict.fromkeys(name for one, own in pairs for name in one.truth_names(own)))
-
-    @property
-    def target_names(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(name for one in self.tasks for name in one.target_names))
+        return tuple(task.truth(facts) for task in self.tasks)
 
     def loss(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
-        return torch.stack([one.loss(*own) for one, *own in self._each(output, truth)]).amax(dim=0)
+        return torch.stack([task.loss(*judged) for task, *judged in self._each(output, truth)]).amax(dim=0)
 
     def score(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
-        return torch.stack([one.score(*own) for one, *own in self._each(output, truth)]).amin(dim=0)
+        return torch.stack([task.score(*judged) for task, *judged in self._each(output, truth)]).amin(dim=0)
 
     def predictions(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Prediction, ...]]:
-        said = [one.predictions(own) for one, own in zip(self.tasks, of_each(output), strict=True)]
-        return [(all_said([first for first, *_ in each]),) for each in zip(*said, strict=True)]
+        said = [task.predictions(shown) for task, shown in zip(self.tasks, of_each(output), strict=True)]
+        return [(all_said(first for first, *_ in each),) for each in zip(*said, strict=True)]
 
     def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
-        found = []
-        for each in zip(*(one.judge(*own) for one, *own in self._each(output, truth)), strict=True):
-            payloads = {model.name: one.payload for model, one in zip(self.models, each, strict=True)}
-            payload = payloads if any(one is not None for one in payloads.values()) else None
-            margin = math.nan if any(one.not_a_number for one in each) else min(one.margin for one in each)
-            prediction = all_said([one.prediction for one in each])
-            found.append(Judgement.of(min(one.score for one in each), margin, prediction, payload))
-        return found
+        judgements = []
+        for each in zip(*(task.judge(*judged) for task, *judged in self._each(output, truth)), strict=True):
+            payloads = {model.name: judged.payload for model, judged in zip(self.models, each, strict=True)}
+            payload = payloads if any(kept is not None for kept in payloads.values()) else None
+            margin = math.nan if any(judged.not_a_number for judged in each) else min(judged.margin for judged in each)
+            prediction = all_said(judged.prediction for judged in each)
+            judgements.append(Judgement.of(min(judged.score for judged in each), margin, prediction, payload))
+        return judgements
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
         """See `Task.marks`: what is true of the first, maps of all, and what each model says under its name."""
-        found: list[list[Mark]] = [[] for _ in output]
-        for number, (one, *own) in enumerate(self._each(output, truth)):
-            for listed, marks in zip(found, one.marks(*own), strict=True):
-                listed += [mark for mark in marks if mark.true and (not number or mark.map is not None)]
+        pictures: list[list[Mark]] = [[] for _ in output]
+        for number, (task, *judged) in enumerate(self._each(output, truth)):
+            for picture, marks in zip(pictures, task.marks(*judged), strict=True):
+                picture += [mark for mark in marks if mark.true and (not number or mark.map is not None)]
                 name = self.models[number].name
-                listed += [replace(mark, text=f"{name}: {mark.text}") for mark in marks if not mark.true]
-        return found
+                picture += [replace(mark, text=f"{name}: {mark.text}") for mark in marks if not mark.true]
+        return pictures
 
     def _each(self, output: Sequence[Outputs], truth: Truths) -> list[tuple[Any, Any, Any]]:
         return list(zip(self.tasks, of_each(output), truth, strict=True))
-
-
-def all_said(predictions: Sequence[Prediction]) -> Prediction:
-    """Return several predictions as one, in words."""
-    return Prediction("; ".join(one.label for one in predictions))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -194,103 +213,80 @@ def all_said(predictions: Sequence[Prediction]) -> Prediction:
 #
 # A search is after a wrong prediction about any of them: loss and score are the largest of the things' own.
 
-TruthOfEach = Mapping[str, Truth]
-"""What is true of each thing, by name."""
+TruthOfEach = Mapping[str, Truth]  # what is true of each thing, by name
 
 
 @dataclass(frozen=True, kw_only=True)
-class EachThing(Task):
-    """Made by `each_thing`.
-
-    Args:
-        part: the task, on its model.
-    """
+class EachThing(Joined):
+    """Made by `each_thing`."""
 
     name = "each thing"
-    varies = True
 
-    part: Task
+    part: Task  # on its model
 
     @property
-    def calibrates(self) -> bool:
-        return self.part.calibrates
+    def judges(self) -> tuple[Task, ...]:
+        return (self.part,)
 
     def after_calibration(self, output: Output, truth: TruthOfEach | None) -> EachThing:
         first = None if truth is None else next(iter(truth.values()))
         return replace(self, part=self.part.after_calibration(output, first))
 
     def check(self, facts: Facts) -> None:
-        for one in facts.each.values():
-            self.part.check(one)
+        for thing in facts.each.values():
+            self.part.check(thing)
 
     def truth(self, facts: Facts) -> TruthOfEach:
-        return {name: self.part.truth(one) for name, one in facts.each.items()}
-
-    def truth_names(self, truth: TruthOfEach) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(name for one in truth.values() for name in self.part.truth_names(one)))
-
-    @property
-    def target_names(self) -> tuple[str, ...]:
-        return self.part.target_names
+        return {name: self.part.truth(thing) for name, thing in facts.each.items()}
 
     def loss(self, output: Output, truth: TruthOfEach) -> Tensor:
-        return self._largest(self.part.loss, output, truth)
+        return self._largest("loss", output, truth)
 
     def score(self, output: Output, truth: TruthOfEach) -> Tensor:
-        return -self.loss(output, truth) if self.minimise else self._largest(self.part.score, output, truth)
+        return -self.loss(output, truth) if self.minimise else self._largest("score", output, truth)
 
     def pixel_margin(self, output: Output, truth: TruthOfEach) -> Tensor:
         """Return that of the thing where it is largest, (N,); of segmentation."""
-        return self._largest(self.part.pixel_margin, output, truth)  # type: ignore[attr-defined]
+        return self._largest("pixel_margin", output, truth)
 
-    @staticmethod
-    def _largest(value: Callable[[Output, Truth], Tensor], output: Output, truth: TruthOfEach) -> Tensor:
-        return torch.stack([value(output, one) for one in truth.values()]).amax(dim=0)
+    def _largest(self, value: str, output: Output, truth: TruthOfEach) -> Tensor:
+        return torch.stack([getattr(self.part, value)(output, true) for true in truth.values()]).amax(dim=0)
 
     def predictions(self, output: Output, count: int = 1) -> list[tuple[Prediction, ...]]:
         return self.part.predictions(output, count)
 
-    def judge(self, output: Output, truth: TruthOfEach) -> list[Judgement]:
-        """See `Task.judge`: the prediction about the thing that is worst, and in the payload what is said of each."""
-        each = zip(*(self.part.judge(output, one) for one in truth.values()), strict=True)
-        with torch.no_grad():
-            scores, margins = self.score(output, truth).tolist(), (0.0 - self.loss(output, truth)).tolist()
-        return [
-            self._judged(dict(zip(truth, said, strict=True)), *at)
-            for said, at in zip(each, zip(scores, margins, strict=True), strict=True)
-        ]
-
-    @staticmethod
-    def _judged(said: Mapping[str, Judgement], score: float, margin: float) -> Judgement:
-        if any(one.not_a_number for one in said.values()):
-            return Judgement.of(score, math.nan, Prediction(""))
-        seen = [name for name in said if said[name].prediction.label != OUT_OF_VIEW] or list(said)
-        worst = min(seen, key=lambda name: said[name].margin)
-        things = {
-            name: {"right": one.right, "margin": one.margin, "answer": one.prediction.label}
-            | ({"box": one.payload.get("box")} if isinstance(one.payload, dict) and "box" in one.payload else {})
-            for name, one in said.items()
-        }
-        kept: Any = said[worst].payload if isinstance(said[worst].payload, dict) else {}
-        average = mean([one.margin for one in said.values()])
-        payload: Any = {**kept, "worst": worst, "mean_margin": average, "things": things}
-        return Judgement.of(score, margin, said[worst].prediction, payload)
+    def said(self, output: Output, truth: TruthOfEach, margins: Sequence[float]) -> list[Said]:
+        """See `Task.said`: the prediction about the thing that is worst, and in the payload what is said of each."""
+        found: list[Said] = []
+        for judged in zip(*(self.part.judge(output, true) for true in truth.values()), strict=True):
+            by_name = dict(zip(truth, judged, strict=True))
+            seen = [name for name, thing in by_name.items() if thing.prediction.label != OUT_OF_VIEW] or list(by_name)
+            worst = min(seen, key=lambda name: by_name[name].margin)
+            payloads: dict[str, Any] = {
+                name: thing.payload if isinstance(thing.payload, dict) else {} for name, thing in by_name.items()
+            }
+            things = {
+                name: {"right": thing.right, "margin": thing.margin, "answer": thing.prediction.label}
+                | ({"box": payloads[name]["box"]} if "box" in payloads[name] else {})
+                for name, thing in by_name.items()
+            }
+            average = mean([thing.margin for thing in judged])
+            payload = {**payloads[worst], "worst": worst, "mean_margin": average, "things": things}
+            found.append((by_name[worst].prediction, payload))
+        return found
 
     def marks(self, output: Output, truth: TruthOfEach) -> list[list[Mark]]:
         """See `Task.marks`: what is true of each thing, and the prediction once."""
-        found: list[list[Mark]] = []
-        for marks in zip(*(self.part.marks(output, one) for one in truth.values()), strict=True):
-            said = [mark for mark in marks[0] if not mark.true]
-            found.append([mark for listed in marks for mark in listed if mark.true] + said)
-        return found
+        each = zip(*(self.part.marks(output, true) for true in truth.values()), strict=True)
+        return [
+            [mark for thing in things for mark in thing if mark.true] + [mark for mark in things[0] if not mark.true]
+            for things in each
+        ]
 
 
 def each_thing(task: Task) -> EachThing:
-    """Return a task on its model as one that judges every thing.
-
-    Raises:
-        InputError: its models say one thing of a whole picture, or are several.
-    """
+    """Return a task on its model as one that judges every thing. Raises InputError: its models say one thing of a whole
+    picture, or are several."""
     if isinstance(task, Together) or task.name not in JUDGES:
         raise InputError(
             f"judge: all is for {' and '.join(JUDGES)}, got task {task.name}; judge one thing, by its name"
@@ -311,7 +307,7 @@ RULES = ("any", "all", "mean", "vote")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rig(Task):
+class Rig(Joined):
     """Several cameras take pictures of one configuration, and one prediction is made of what a model says of each.
 
     Each picture has a truth of its own, such as the box in it. The loss of the rig is the least, the largest or the
@@ -320,26 +316,27 @@ class Rig(Task):
     Args:
         task: of each picture: a name, or a mapping with a `name` and options.
         rule: one of `RULES`.
-        part: the task on the model, by `on`.
-        cameras: how many there are, by `on`.
 
     Raises:
         InputError: no such rule.
     """
 
     name = "rig"
-    varies = True
 
     task: Any = "classification"
     rule: str = RULES[0]
-    part: Any = field(default=None, metadata=FROM_RUN)
-    cameras: int = field(default=1, metadata=FROM_RUN)
+    part: Any = field(default=None, metadata=FROM_RUN)  # the task on the model
+    cameras: int = field(default=1, metadata=FROM_RUN)  # how many there are
 
     def __post_init__(self) -> None:
         if self.rule not in RULES:
             raise InputError(f"task rig: rule: expected one of {', '.join(RULES)}, got {self.rule!r}")
         if not isinstance(self.task, (str, Mapping, Task)):
             raise InputError(f"task rig: task: expected a name, or a mapping with a `name`, got {self.task!r:.80}")
+
+    @property
+    def judges(self) -> tuple[Any, ...]:
+        return (self.part,)
 
     @property
     def title(self) -> str:
@@ -366,43 +363,24 @@ class Rig(Task):
     def read(self, returned: Any, count: int) -> Any:
         return returned
 
-    @property
-    def calibrates(self) -> bool:
-        return bool(self.part.calibrates)
-
-    def after_calibration(self, output: Sequence[Outputs], truth: tuple[Truth, ...] | None) -> Rig:
+    def after_calibration(self, output: Sequence[Outputs], truth: Truths | None) -> Rig:
         return replace(self, part=self.part.after_calibration(output[0][0], None if truth is None else truth[0]))
 
-    @property
-    def ambiguities(self) -> str:
-        return str(self.part.ambiguities)
+    def truth(self, facts: Facts) -> Truths:
+        return tuple(self.part.truth(view) for view in facts.views or (facts,) * self.cameras)
 
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        return tuple(self.part.remarks)
-
-    def truth(self, facts: Facts) -> tuple[Truth, ...]:
-        return tuple(self.part.truth(one) for one in facts.views or (facts,) * self.cameras)
-
-    def truth_names(self, truth: tuple[Truth, ...]) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(name for one in truth for name in self.part.truth_names(one)))
-
-    @property
-    def target_names(self) -> tuple[str, ...]:
-        return tuple(self.part.target_names)
-
-    def loss(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
+    def loss(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
         return self._ruled(self._each("loss", output, truth))
 
-    def score(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
+    def score(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
         """See `Task.score`: a target is reached, and a right prediction made, by the rule."""
         scores = self._each("score", output, truth)
         return -self._ruled(-scores) if self.target is not None or self.minimise else self._ruled(scores)
 
-    def _each(self, what: str, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> Tensor:
+    def _each(self, value: str, output: Sequence[Outputs], truth: Truths) -> Tensor:
         """A number of each picture, (N, K)."""
-        each = [[getattr(self.part, what)(*pair) for pair in zip(one, truth, strict=True)] for one in output]
-        return torch.stack([torch.cat(one) for one in each])
+        of_picture: Callable[[Any, Truth], Tensor] = getattr(self.part, value)
+        return torch.stack([torch.cat(list(map(of_picture, pictures, truth))) for pictures in output])
 
     def _ruled(self, wrong: Tensor) -> Tensor:
         """How wrong the rig is, (N,), from how wrong it is in each picture, (N, K)."""
@@ -412,31 +390,28 @@ class Rig(Task):
         return wrong.sort(dim=1).values[:, place]
 
     def predictions(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Prediction, ...]]:
-        return [(all_said([self.part.predictions(one)[0][0] for one in each]),) for each in output]
+        return [(all_said(self.part.predictions(picture)[0][0] for picture in each),) for each in output]
 
-    def judge(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> list[Judgement]:
-        found = []
+    def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
         with torch.no_grad():
             margins, scores = (0.0 - self.loss(output, truth)).tolist(), self.score(output, truth).tolist()
-        for each, margin, score in zip(output, margins, scores, strict=True):
-            said = [self.part.judge(one, true)[0] for one, true in zip(each, truth, strict=True)]
-            lost = any(one.not_a_number for one in said)
-            payload: Any = {
-                "pictures": [
-                    {"prediction": one.prediction.label, "right": one.right, "payload": one.payload} for one in said
-                ]
-            }
-            prediction = all_said([one.prediction for one in said])
-            found.append(Judgement.of(score, math.nan if lost else margin, prediction, payload))
-        return found
+        judgements = []
+        for pictures, margin, score in zip(output, margins, scores, strict=True):
+            each = [self.part.judge(*judged)[0] for judged in zip(pictures, truth, strict=True)]
+            margin = math.nan if any(judged.not_a_number for judged in each) else margin
+            kept: list[JsonValue] = [
+                {"prediction": judged.prediction.label, "right": judged.right, "payload": judged.payload}
+                for judged in each
+            ]
+            prediction = all_said(judged.prediction for judged in each)
+            judgements.append(Judgement.of(score, margin, prediction, {"pictures": kept}))
+        return judgements
 
-    def marks(self, output: Sequence[Outputs], truth: tuple[Truth, ...]) -> list[list[Mark]]:
+    def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
         """See `Task.marks`: those of the first picture, which is at the left."""
-        found = []
-        for each in output:
-            marks = self.part.marks(each[0], truth[0])[0]
-            found.append([replace(one, mask=self._wide(one.mask)) for one in marks if one.map is None])
-        return found
 
-    def _wide(self, mask: Tensor | None) -> Tensor | None:
-        return None if mask is None else torch.cat([mask, *[torch.zeros_like(mask)] * (self.cameras - 1)], dim=-1)
+        def widened(mask: Tensor | None) -> Tensor | None:
+            return None if mask is None else torch.cat([mask, *[torch.zeros_like(mask)] * (self.cameras - 1)], dim=-1)
+
+        each = [self.part.marks(pictures[0], truth[0])[0] for pictures in output]
+        return [[replace(mark, mask=widened(mark.mask)) for mark in marks if mark.map is None] for marks in each]

@@ -157,8 +157,8 @@ def write_page(run: Path, result: Result | None = None) -> Path:
 def page_of(run: Path, result: Result) -> str:
     """Return the page of a run, which needs no other file but those of its parts. Raises FileFormatError where other
     results of the run are damaged."""
-    room = registry.room(result.command)
-    made: str | None = room.page(run, result) if room and room.page else None
+    page = registry.part_of(result.command, "page")
+    made: str | None = page(run, result) if page else None
     return made or shown_page(run, result, shown(result))
 
 

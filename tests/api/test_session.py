@@ -27,7 +27,7 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS
 from advsearch.controls import Control
-from advsearch.controls.numbers import NumberControl
+from advsearch.controls.base import NumberControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
 from advsearch.errors import AdvsearchError, InputError

@@ -30,8 +30,8 @@ from advsearch.attacks import (
 from advsearch.attacks.domain import project_l2_box
 from advsearch.attacks.evaluation import one_thread
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.controls.base import Parameter, read, to_unit, to_value
-from advsearch.controls.ranges import Range
+from advsearch.controls.base import Parameter
+from advsearch.controls.ranges import Range, read
 from advsearch.files import JsonObject
 from advsearch.models import load_model
 from advsearch.models.model import Model, Preprocessing
@@ -454,11 +454,11 @@ def lamp_and_rotation(watt: float, degree: float) -> Toy:
     ranges = [spec for spec in specs if isinstance(spec, Range)]
 
     def value(u: Tensor) -> Tensor:
-        watts = to_value(ranges[0], False, u[0]) / watt
-        degrees = to_value(ranges[1], False, u[1]) / degree
+        watts = ranges[0].at(u[0]) / watt
+        degrees = ranges[1].at(u[1]) / degree
         return -((watts - 7.3) ** 2) - 0.01 * (degrees - 33.0 - 2.0 * watts) ** 2
 
-    return Toy(value, box_domain([to_unit(ranges[0], False, watt), to_unit(ranges[1], False, 10.0 * degree)]))
+    return Toy(value, box_domain([ranges[0].coordinate(watt), ranges[1].coordinate(10.0 * degree)]))
 
 
 def test_a_search_in_milliwatts_and_radians_goes_the_way_of_one_in_watts_and_degrees() -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import Control, make_space
-from advsearch.controls.path import CLEAN_AT, PATHS, PathControl
+from advsearch.controls.path import CLEAN_AT, PATHS, PathControl, start_of
 from advsearch.engine.rendering import sight_of
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.description import SceneDescription, describe
@@ -236,7 +236,7 @@ def test_as_many_times_at_once_are_those_one_by_one(scene: SceneDescription, tmp
     for path in (*PATHS, f"{file}+orbit", f"approach+{file}", "pass+pass"):
         control = PathControl(path=path).within(scene)
         time = torch.linspace(0.0, control.seconds, 7)
-        start = control._start(time)
+        start = start_of(control.scene, time.device)
 
         def both(at: Tensor, control: PathControl = control, start: Any = start) -> Tensor:
             (ways,) = control._paths

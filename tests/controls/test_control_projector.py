@@ -183,7 +183,7 @@ def test_the_stored_png_throws_the_same_picture_and_texels_have_eight_bits(tmp_p
     assert torch.equal(torch.from_numpy(read_png(file)), pattern)
     (thrown,) = space_of(renderer).controls
     assert isinstance(thrown, ProjectorControl)
-    lumens = next(one for one in thrown.slots if one.parameter.name == "lumens").default
+    lumens = next(one for one in thrown.slots if one.parameter.name == "lumens").parameter.default
     again = advsearch.load_scene("mug").renderer(
         [make_control("projector", {"picture": str(file), "lumens": [0, lumens]})], resolution=SIDE
     )

@@ -16,7 +16,7 @@ from torch.distributions import Laplace as TorchLaplace
 
 from advsearch.attacks.domain import Draws
 from advsearch.controls import CameraControl, EnvironmentControl, PatchControl
-from advsearch.controls.numbers import NumberControl
+from advsearch.controls.base import NumberControl
 from advsearch.controls.ranges import DrawnRange
 from advsearch.distributions import as_setting
 from advsearch.engine.loading import as_controls, load_scene, only_here, settings_of

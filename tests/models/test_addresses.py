@@ -446,4 +446,4 @@ def test_the_module_shows_what_it_spends(server: Server) -> None:
     model = advsearch.load_model(server.chat, task="answer", ask={"per_call": 0.5})
     model(torch.zeros((2, 8, 8, 3)))
     assert isinstance(model.module, AskedModel)
-    assert model.module.line.sentence == "The model tiny was asked 1 times, 110 tokens, 0.5 of money."
+    assert model.module.sentence == "The model tiny was asked 1 times, 110 tokens, 0.5 of money."

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from advsearch.errors import InputError, ModelError
 from advsearch.models import Model, ModelWarning, load_model
+from advsearch.models.source import Purpose
 from advsearch.models.zoo import outputs
 from advsearch.models.zoo.transformers import PATIENCE
 from advsearch.tasks import Detection, Similarity
@@ -399,4 +400,4 @@ def test_a_network_of_timm_from_python_brings_its_own(timm: list[str]) -> None:
     before = load_model(OfTimm(), task=Similarity())
     assert before.labels == ()
     torch.testing.assert_close(before(PICTURES), (PICTURES.mean(dim=(1, 2)) - 0.4) / 0.2)
-    assert timm == [] and outputs.of_timm(nn.Linear(3, 3)) is None
+    assert timm == [] and outputs.of_timm(nn.Linear(3, 3), Purpose()) is None

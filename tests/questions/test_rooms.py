@@ -48,10 +48,10 @@ def test_without_the_folders_of_three_questions_the_tool_works(tmp_path: Path) -
 
 def test_every_room_has_what_finds_it() -> None:
     for name in registry.rooms():
-        room = registry.Room(name)
-        if room.config is not None:
-            assert room.config.command == name and room.result.command == name
-            assert room.from_config is not None
+        config, result, ask = (registry.part_of(name, part) for part in ("config", "result", "from_config"))
+        if config is not None:
+            assert config.command == name and result.command == name
+            assert ask is not None
 
 
 def test_the_question_of_the_docs_is_one_file(tmp_path: Path) -> None:

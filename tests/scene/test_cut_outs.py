@@ -14,8 +14,9 @@ from trimesh.visual.material import PBRMaterial
 
 import advsearch
 from advsearch.controls import make_control, make_space
+from advsearch.scene.assembly import posed
 from advsearch.scene.description import OBJECT
-from advsearch.scene.glb import glb, posed
+from advsearch.scene.glb import glb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.mitsuba_backend.writing import write_scene

@@ -19,11 +19,12 @@ from trimesh.visual.material import PBRMaterial
 
 import advsearch
 from advsearch.errors import FileFormatError, InputError
+from advsearch.scene.assembly import posed
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription, describe
 from advsearch.scene.formation import EVERYTHING, irradiance
-from advsearch.scene.glb import glb, posed
+from advsearch.scene.glb import glb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.mitsuba_backend.meshes import sampling_weights
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene

@@ -286,6 +286,19 @@ def test_haze_is_one_grey_medium_in_a_ball_around_the_camera(changed: dict[str, 
         assert (haze.radius, haze.density) == pytest.approx((4.0, 0.2 * scale)) and used == {"ball", "fog"}
 
 
+@pytest.mark.parametrize("inside", [True, False])
+def test_a_medium_is_scaled_with_the_object_wherever_it_stands(inside: bool) -> None:
+    smoke: dict[str, Any] = {"type": "homogeneous", "sigma_t": 1.0}
+    held: Any = smoke if inside else {"type": "ref", "id": "smoke"}
+    cloud = {"type": "sphere", "center": [0, 0, 9], "bsdf": {"type": "null"}, "interior": held}
+    scene = {"type": "scene", "box": {"type": "cube"}, "cloud": cloud, **({} if inside else {"smoke": smoke})}
+    parts = {
+        part.name: part.plugin for part in import_plugins(scene, "box").surroundings if isinstance(part, PluginPart)
+    }
+    medium: Any = parts["cloud"]["interior"] if inside else parts["smoke"]
+    assert medium["scale"] == 2.0  # the cube is 2 wide
+
+
 def test_import_says_on_standard_output_what_a_scene_has(box: Path) -> None:
     """In a process of its own, as standard output is kept clean of Mitsuba's by the descriptor."""
     code = "import sys\nfrom advsearch.cli.main import main\nw = sys.argv[1:]\nsys.exit(main([*w, '--json']) | main(w))"

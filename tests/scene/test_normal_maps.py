@@ -19,9 +19,10 @@ from trimesh.visual.material import PBRMaterial
 
 import advsearch
 from advsearch.errors import FileFormatError
+from advsearch.scene.assembly import posed
 from advsearch.scene.assets import Floats, ObjectAsset
 from advsearch.scene.description import OBJECT, SceneDescription, describe
-from advsearch.scene.glb import glb, posed
+from advsearch.scene.glb import glb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.parts import FLAT, holds_normals, normal_map
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene

@@ -11,12 +11,11 @@ import pytest
 from advsearch.errors import FileFormatError
 from advsearch.files import MESHES
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.importing.other_formats import ASSIMP_READS, BLENDER_READS, SAID, advice
+from advsearch.scene.importing.other_formats import BLENDER_READS, SAID, advice
 
 ENDINGS = [one for _, endings in BLENDER_READS.values() for one in endings]
-ENDINGS += [one for endings in ASSIMP_READS.values() for one in endings]
 ENDINGS += [one for _, endings in SAID.values() for one in endings]
-ENDINGS += [".step", ".stp", ".iges", ".igs", ".brep", ".ifc", ".b3dm", ".bin"]
+ENDINGS += [".bin"]
 
 
 @pytest.mark.parametrize(

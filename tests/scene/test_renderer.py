@@ -224,8 +224,6 @@ def test_what_cannot_be_rendered_is_refused(raw: Renderer) -> None:
         raw(torch.full_like(raw.start, float("nan")))
     with pytest.raises(InputError, match="spp: expected 1 to 65536"):
         raw(raw.start, spp=0)
-    with pytest.raises(InputError, match="the denoiser needs the box filter"):
-        ImageFormation(denoiser="oidn", filter="gaussian")
     with pytest.raises(InputError, match="denoise: expected one of oidn, none"):
         ImageFormation(denoiser="median")
     with pytest.raises(InputError, match="resolution: expected 8 to 4096"):

@@ -81,8 +81,8 @@ def test_what_is_not_said_of_the_distance_follows_the_object_in_its_unit() -> No
     control = CameraControl()
     (distance,) = (one for one in control.own if one.name == "distance")
     scene = describe("car")
-    fitted = control.within(scene).default(distance)
-    low, high = control.within(scene).search_range(distance) or (0.0, 0.0)
+    there = control.within(scene).in_scene(distance)
+    fitted, (low, high) = there.default, there.search or (0.0, 0.0)
     assert (low, high) == pytest.approx((0.8 * float(fitted), 1.5 * float(fitted)))
     assert float(fitted) > 5.0  # metres
 

@@ -31,7 +31,7 @@ def test_a_ball_of_fewer_faces_is_still_a_closed_ball(most: int) -> None:
     own = ball()
     found = simpler(own, most)
     assert found is not None
-    less = found.of(own)
+    less = found(own)
     assert most / 4 < len(less.faces) <= most
     radius = np.linalg.norm(less.vertices, axis=1)
     assert radius.max() <= 1.0 + 1e-6 and radius.min() > 1.0 - 40 / most
@@ -40,7 +40,7 @@ def test_a_ball_of_fewer_faces_is_still_a_closed_ball(most: int) -> None:
     assert (np.einsum("fi,fi->f", outwards, first + second + third) > 0).all()  # no face was turned over
     area = np.linalg.norm(outwards, axis=1).sum() / 2
     assert area == pytest.approx(4 * np.pi, rel=0.03 if most > 2000 else 0.08)
-    moved = found.of(Mesh(own.vertices + np.float32(1), own.faces, own.normals, own.uvs))
+    moved = found(Mesh(own.vertices + np.float32(1), own.faces, own.normals, own.uvs))
     np.testing.assert_allclose(moved.vertices, less.vertices + 1, atol=1e-5)
 
 
@@ -48,7 +48,7 @@ def test_a_seam_stays_shut() -> None:
     own = ball()
     found = simpler(own, 5_000)
     assert found is not None
-    _, together = np.unique(found.of(own).vertices, axis=0, return_inverse=True)
-    edges = together.reshape(-1)[found.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)]
+    _, together = np.unique(found(own).vertices, axis=0, return_inverse=True)
+    edges = together.reshape(-1)[found(own).faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)]
     _, shared = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
     assert (shared == 2).mean() > 0.99  # an edge without a neighbour is one of a gap

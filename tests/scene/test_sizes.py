@@ -15,10 +15,11 @@ from advsearch.controls.path import PathControl
 from advsearch.engine.loading import load_scene, scene_as_settings
 from advsearch.errors import InputError
 from advsearch.scene import library
+from advsearch.scene.assembly import posed
 from advsearch.scene.assets import on_roads
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.glb import glb, posed
+from advsearch.scene.glb import glb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import import_scene
 from advsearch.scene.places.quads import ROAD

@@ -15,7 +15,7 @@ from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model
 from advsearch.tasks import Detection, Facts, Judgement, Prediction, Sight
-from advsearch.tasks.boxes import Place, corners, log_odds, overlap, share_inside, strongest
+from advsearch.tasks.boxes import Place, corners, left_over, log_odds, overlap, share_inside
 from advsearch.tasks.detection import GOALS
 from advsearch.tasks.detector_outputs import detections_in
 
@@ -63,8 +63,8 @@ def test_all_forms_of_a_box_are_the_same_corners() -> None:
 
 def test_of_boxes_that_overlap_the_best_one_is_left() -> None:
     boxes, scores = torch.tensor([HERE, NEAR, AWAY]), torch.tensor([0.5, 0.9, 0.6])
-    assert strongest(boxes, scores, 5, 0.5) == [1, 2] and strongest(boxes, scores, 1, 0.5) == [1]
-    assert strongest(boxes, scores, 5, 0.7) == [1, 2, 0]
+    assert left_over(boxes, scores, 0.5).tolist() == [False, True, True]
+    assert left_over(boxes, scores, 0.7).all()
 
 
 # ---- what a detector returns ----------------------------------------------------------------------------------------

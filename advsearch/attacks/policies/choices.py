@@ -17,7 +17,7 @@ from torch import Tensor
 
 from advsearch.attacks.candidates import Failures
 from advsearch.attacks.domain import Block, Distribution, Domain, centre_of_option
-from advsearch.attacks.evaluation import NO_COUNTS, Counts, Evaluated, Policy, Proposal, affordable, draw_seed, seeded
+from advsearch.attacks.evaluation import NO_COUNTS, Counts, Evaluated, Policy, Proposal, draw_seed, seeded
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +88,7 @@ class Race:
             wanted = proposals[k][taken[k]]
             capped = replace(wanted, samples=min(runner.left, wanted.samples))
             later = self.round + 1 < self.rounds  # there will be renders to use a gradient
-            batch.append(affordable(capped, runner.domain, runner.left + later))
+            batch.append(capped.affordable(runner.domain, runner.left + later))
             asked.append(k)
             taken[k] += 1
             runners[k] = replace(runner, left=runner.left - batch[-1].cost(runner.domain))

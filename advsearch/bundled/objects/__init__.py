@@ -16,9 +16,6 @@ _HOUSEHOLD = (
 )  # fmt: skip
 HOUSEHOLD: dict[str, ObjectFamily] = {family.name: family for family in _HOUSEHOLD}
 """What the reference model is trained on."""
-
 STREET: dict[str, ObjectFamily] = {family.name: family for family in (car, stop_sign, person)}
-
 OBJECTS: dict[str, ObjectFamily] = HOUSEHOLD | STREET
-
 __all__ = ["HOUSEHOLD", "OBJECTS", "STREET", "Instance", "ObjectFamily"]

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from itertools import pairwise, product
 
 import numpy as np
+from scipy.special import logsumexp
 
 import advsearch.bundled.objects.shapes as shapes
 from advsearch.bundled.objects.draw import Draw, hexed
@@ -27,9 +28,6 @@ COLUMNS = 92
 Height = Callable[[Array, Array, Array], Array]
 
 
-# ------------------------------------------------------------------------------------------------------- outlines
-
-
 def _outline(angle: Array, front: float, rear: float, half: float, power: float, middle: float) -> tuple[Array, Array]:
     """x and y of a superellipse about (middle, 0) that reaches from `rear` to `front` and `half` to each side."""
     c, s = np.cos(angle), np.sin(angle)
@@ -38,15 +36,8 @@ def _outline(angle: Array, front: float, rear: float, half: float, power: float,
 
 
 def _shell(rows: Array, power: float, middle: float, height: Height, corner: float) -> list[Patch]:
-    """Painted patches of a stack of outlines.
-
-    Args:
-        rows: (R, 4) share of the height, half the width, front and rear end of each.
-        power: of the superellipses.
-        middle: x about which they are drawn.
-        height: from share, x and y to z.
-        corner: share of the columns from the middles of front and rear at which it is cut.
-    """
+    """Painted patches of a stack of superellipses with a power about an x: of each a share of the height, half the
+    width, front and rear end, (R, 4); they are cut at a share of the columns from the middles of front and rear."""
     # angles are equally far apart along the widest outline, symmetrical, from the rear's middle
     _, half, front, rear = rows[np.argmax(rows[:, 1])]
     fine = np.linspace(-np.pi, np.pi, 8001)
@@ -71,19 +62,14 @@ def _shell(rows: Array, power: float, middle: float, height: Height, corner: flo
 
 
 def _line(knots: list[tuple[float, float]]) -> Callable[[Array], Array]:
-    """A smooth function through knots (x, value) in order of x."""
     curve = shapes.spline(knots, 200)
     return lambda x: np.interp(x, curve[:, 0], curve[:, 1])
 
 
 def _softest(*fields: Array) -> Array:
     """The least of some distances, with corners rounded by about 3 cm."""
-    k = 30.0
-    values: Array = -np.log(np.exp(-k * np.clip(np.stack(fields), -1.0, 1.0)).sum(axis=0)) / k
-    return values
+    return np.asarray(logsumexp(-30.0 * np.clip(np.stack(fields), -1.0, 1.0), axis=0) / -30.0)
 
-
-# ----------------------------------------------------------------------------------------------------------- body
 
 _BOTTOM = _line([(-2.2, 0.30), (-1.7, 0.20), (0.0, 0.175), (1.7, 0.185), (2.2, 0.235)])
 _WAIST = _line(
@@ -94,34 +80,18 @@ _WAIST = _line(
 )  # fmt: skip
 _ROOF = _line([(-2.2, 1.26), (-1.75, 1.345), (-1.3, 1.405), (-0.7, 1.435), (-0.2, 1.43), (0.2, 1.395), (1.1, 1.2)])
 _BODY = [  # share of the height, half the width, front end, rear end
-    (0.0, 0.80, 1.98, -2.0),
-    (0.03, 0.835, 2.06, -2.06),
-    (0.1, 0.86, 2.1, -2.1),
-    (0.28, 0.872, 2.135, -2.135),
-    (0.45, 0.878, 2.14, -2.14),
-    (0.62, 0.889, 2.13, -2.125),
-    (0.75, 0.898, 2.1, -2.1),
-    (0.82, 0.885, 2.06, -2.085),
-    (0.9, 0.868, 2.01, -2.065),
-    (0.96, 0.845, 1.95, -2.04),
-    (0.985, 0.82, 1.89, -2.01),
-    (1.0, 0.78, 1.79, -1.965),
-]
+    (0.0, 0.80, 1.98, -2.0), (0.03, 0.835, 2.06, -2.06), (0.1, 0.86, 2.1, -2.1), (0.28, 0.872, 2.135, -2.135),
+    (0.45, 0.878, 2.14, -2.14), (0.62, 0.889, 2.13, -2.125), (0.75, 0.898, 2.1, -2.1), (0.82, 0.885, 2.06, -2.085),
+    (0.9, 0.868, 2.01, -2.065), (0.96, 0.845, 1.95, -2.04), (0.985, 0.82, 1.89, -2.01), (1.0, 0.78, 1.79, -1.965),
+]  # fmt: skip
 _CABIN = [
-    (0.0, 0.795, 1.0, -1.955),
-    (0.25, 0.765, 0.79, -1.9),
-    (0.5, 0.732, 0.57, -1.83),
-    (0.75, 0.692, 0.34, -1.74),
-    (0.88, 0.663, 0.2, -1.66),
-    (0.95, 0.63, 0.08, -1.58),
-    (0.985, 0.58, -0.06, -1.47),
-    (1.0, 0.5, -0.22, -1.3),
-]
+    (0.0, 0.795, 1.0, -1.955), (0.25, 0.765, 0.79, -1.9), (0.5, 0.732, 0.57, -1.83), (0.75, 0.692, 0.34, -1.74),
+    (0.88, 0.663, 0.2, -1.66), (0.95, 0.63, 0.08, -1.58), (0.985, 0.58, -0.06, -1.47), (1.0, 0.5, -0.22, -1.3),
+]  # fmt: skip
 _BODY_POWER, _CABIN_POWER = 4.2, 4.6
 
 
 def _deck(x: Array, y: Array) -> Array:
-    """The height at which the body ends and the cabin begins."""
     return np.asarray(_WAIST(x) + 0.045 * (1.0 - (y / 0.8) ** 2))
 
 
@@ -189,40 +159,31 @@ def _body_and_cabin() -> list[Patch]:
     return parts["body"] + parts["cabin"]
 
 
-# --------------------------------------------------------------------------------------------------------- wheels
-
-
-def _wheel() -> list[Patch]:
-    """A wheel about the z axis, its outer side up, in the middle of the tyre."""
-    half, rim = TYRE / 2, 0.212
+def _wheels() -> list[Patch]:
+    half, rim = TYRE / 2, 0.212  # about the z axis, the outer side up, in the middle of the tyre
     outside = [(rim, half - 0.008), (rim + 0.012, half), (0.29, half + 0.004), (WHEEL - 0.012, half - 0.02)]
     tread = [(WHEEL, half - 0.05), (WHEEL, 0.0), (WHEEL, 0.05 - half)]
     tyre = [*((r, -z) for r, z in outside), *tread[::-1], *outside[::-1]]
     deep = half - 0.06
-    patches = shapes.lathe([("rubber", tyre)], 28)
-    patches += shapes.lathe([("rim", [(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)])], 28)
-    patches += shapes.lathe([("well", [(rim - 0.02, deep), (0.0, deep)])], 24)
+    wheel = shapes.lathe([("rubber", tyre)], 28)
+    wheel += shapes.lathe([("rim", [(rim, half - 0.008), (rim - 0.014, half - 0.012), (rim - 0.02, deep)])], 28)
+    wheel += shapes.lathe([("well", [(rim - 0.02, deep), (0.0, deep)])], 24)
     spoke = np.array([(0.03, 0.0, half - 0.035), (0.11, 0.0, half - 0.022), (rim - 0.012, 0.0, half - 0.018)])
     section = shapes.rectangle(0.03, 0.03, 0.008, 1)
     for number, side in product(range(5), (-1.0, 1.0)):
         spoke[:, 1] = side * np.array([0.012, 0.018, 0.04])
-        patches += shapes.placed(
-            shapes.sweep("rim", spoke, section, (1.0, 1.0, 1.15)), shapes.rotation("z", 72.0 * number)
-        )
+        turn = shapes.rotation("z", 72.0 * number)
+        wheel += shapes.placed(shapes.sweep("rim", spoke, section, (1.0, 1.0, 1.15)), turn)
     hub = [(0.052, deep), (0.05, half - 0.02), (0.03, half - 0.01), (0.0, half - 0.008)]
-    return patches + shapes.lathe([("rim", shapes.rounded(hub, 0.008, 2))], 20)
-
-
-def _wheels() -> list[Patch]:
+    wheel += shapes.lathe([("rim", shapes.rounded(hub, 0.008, 2))], 20)
     patches = []
     for axle, side in WHEELS:
         turn = shapes.rotation("y", 17.0 * axle) @ shapes.rotation("x", -90.0 * side)
-        patches += shapes.placed(_wheel(), turn, (axle, side * (0.852 - TYRE / 2), WHEEL))
+        patches += shapes.placed(wheel, turn, (axle, side * (0.852 - TYRE / 2), WHEEL))
     return patches
 
 
 def _wells() -> list[Patch]:
-    """The insides of the wheel arches, and the floor."""
     angle = np.radians(np.linspace(-30.0, 210.0, 17))
     outwards = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
     patches = []
@@ -238,9 +199,6 @@ def _wells() -> list[Patch]:
         patches.append(shapes.cap("well", ring, np.array([0.0, side, 0.0])))
     x, y = _outline(np.linspace(np.pi, -np.pi, 41)[:-1], 1.97, -1.99, 0.79, _BODY_POWER, 0.0)
     return [*patches, shapes.cap("well", np.stack([x, y, np.full_like(x, 0.2)], axis=1), np.array([0.0, 0.0, -1.0]))]
-
-
-# ------------------------------------------------------------------------------------------------------- fittings
 
 
 def _fittings() -> list[Patch]:
@@ -262,9 +220,6 @@ def _fittings() -> list[Patch]:
         patches += shapes.box("paint", (x, side * 0.889, 0.775), (0.2, 0.032, 0.028), 0.011, 1)
     spoiler = shapes.box("paint", (0, 0, 0), (0.2, 1.04, 0.035), 0.015, 2, 2)
     return [*patches, *shapes.placed(spoiler, shapes.rotation("y", 9.0), (-1.60, 0.0, 1.364))]
-
-
-# --------------------------------------------------------------------------------------------------------- paints
 
 
 _DOORS = (
@@ -304,7 +259,6 @@ def _panes(t: Texels) -> Array:
 
 
 def _lamps(t: Texels) -> Array:
-    """A headlight: two round lamps in a bright housing."""
     _, y, z = t.xyz.T
     out = np.abs(y)
     lamp = np.minimum(np.hypot(out - 0.58, z - 0.62), np.hypot(out - 0.71, z - 0.64))
@@ -318,7 +272,6 @@ def _tail(t: Texels) -> Array:
 
 
 def _slats(t: Texels) -> Array:
-    """Dark plastic; the grilles have bright slats."""
     x, _, z = t.xyz.T
     slat = np.where((x > 1.9) & (z > 0.48), step(0.006 - np.abs((z % 0.034) - 0.017), 0.0, 0.006), 0.0)
     return mix(hexed("17181a"), hexed("8b9095"), slat)
@@ -337,16 +290,10 @@ def _plate(t: Texels, ground: Array) -> Array:
 
 GLASS = Material(roughness=0.04, specular=0.6)
 FINISHES = {
-    "paint": Material(roughness=0.38, clearcoat=1.0),
-    "glass": GLASS,
-    "headlight": GLASS,
-    "taillight": GLASS,
-    "rubber": Material(roughness=0.85),
-    "rim": Material(roughness=0.3, metallic=0.9),
-    "trim": Material(roughness=0.5),
-    "plate": Material(roughness=0.4),
-    "well": Material(roughness=0.95),
-}
+    "paint": Material(roughness=0.38, clearcoat=1.0), "glass": GLASS, "headlight": GLASS, "taillight": GLASS,
+    "rubber": Material(roughness=0.85), "rim": Material(roughness=0.3, metallic=0.9), "trim": Material(roughness=0.5),
+    "plate": Material(roughness=0.4), "well": Material(roughness=0.95),
+}  # fmt: skip
 
 
 @family(metres=1.0, texels=384)
@@ -356,15 +303,9 @@ def car(draw: Draw) -> Instance:
     patches = [*_body_and_cabin(), *_wheels(), *_wells(), *_fittings()]
     metal = draw.colour("c4c7ca", "8d9094", "2d2f31", wild=0.0)
     paints: dict[str, Paint] = {
-        "paint": _lacquer(color),
-        "glass": _panes,
-        "headlight": _lamps,
-        "taillight": _tail,
-        "rubber": solid("1c1c1d"),
-        "rim": solid(metal),
-        "trim": _slats,
-        "plate": _plate(draw.colour("f2f2ec", "f0d264", wild=0.0)),
+        "paint": _lacquer(color), "glass": _panes, "headlight": _lamps, "taillight": _tail, "rubber": solid("1c1c1d"),
+        "rim": solid(metal), "trim": _slats, "plate": _plate(draw.colour("f2f2ec", "f0d264", wild=0.0)),
         "well": solid("0a0a0b"),
-    }
+    }  # fmt: skip
     detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
     return Instance(shapes.stretched(patches, stretch), paints, FINISHES["paint"], detail, FINISHES)

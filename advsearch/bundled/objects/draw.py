@@ -11,9 +11,7 @@ import numpy as np
 from advsearch.bundled.objects.shapes import Array
 
 T = TypeVar("T")
-
-Color = Array
-"""(3,) display-referred sRGB."""
+Color = Array  # (3,) display-referred sRGB
 
 
 def hexed(code: str) -> Color:
@@ -23,13 +21,9 @@ def hexed(code: str) -> Color:
 
 @dataclass(frozen=True)
 class Draw:
-    """Draws an instance's proportions; without a generator, gives the canonical ones.
+    """Draws an instance's proportions; without a generator, gives the canonical ones."""
 
-    Attributes:
-        rng: the source of randomness, or None for the canonical instance.
-    """
-
-    rng: np.random.Generator | None
+    rng: np.random.Generator | None  # the source of randomness, or None for the canonical instance
 
     def __call__(self, canonical: float, low: float, high: float) -> float:
         """Return a number uniform in [low, high], or the canonical one."""

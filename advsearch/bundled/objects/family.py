@@ -84,9 +84,9 @@ def painted(
     image = np.zeros((side, side, 3))
     used = np.zeros((side, side), dtype=bool)
     for patch, place in zip(patches, places, strict=True):
-        a, b = (  # of every texel, row by row from the bottom, clamped in the gutter
-            np.clip((np.arange(count) + 0.5 - GUTTER) / (count - 2 * GUTTER), 0.0, 1.0)
-            for count in (place.width, place.height)
+        # of every texel, row by row from the bottom, clamped in the gutter
+        a, b = (
+            np.clip((np.arange(n) + 0.5 - GUTTER) / (n - 2 * GUTTER), 0.0, 1.0) for n in (place.width, place.height)
         )
         a, b = np.tile(a, place.height), np.repeat(b, place.width)
         u, v = (b, 1.0 - a) if place.turned else (a, b)
@@ -96,8 +96,7 @@ def painted(
         used[area] = True
     image[~used] = np.round(image[used].mean(axis=0), 2)
     levels = np.clip(np.round(image[::-1] * 255.0, 4) + 0.5, 0.5, 255.5).astype(np.uint8)
-    stored: npt.NDArray[np.float32] = levels.astype(np.float32) / np.float32(255.0)
-    return stored
+    return np.asarray(levels.astype(np.float32) / np.float32(255.0))
 
 
 def joined(patches: Sequence[Patch], places: Sequence[AtlasPlace], side: int = SIZE) -> Mesh:
@@ -126,40 +125,26 @@ def _exact(values: Array) -> npt.NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class Instance:
-    """One member of a family before its texture is baked.
+    """One member of a family before its texture is baked."""
 
-    Attributes:
-        patches: the surface.
-        paints: a paint for every tag of the patches.
-        material: the other surface parameters.
-        detail: texels along an edge relative to the rest of the object, by tag, for parts that are hardly seen.
-        finishes: of an object of several materials, what each tag is like; its tags are then names of materials.
-        rig: what moves the vertices of all patches, in the order of the patches.
-    """
-
-    patches: Sequence[Patch]
-    paints: Mapping[str, Paint]
-    material: Material
+    patches: Sequence[Patch]  # the surface
+    paints: Mapping[str, Paint]  # a paint for every tag of the patches
+    material: Material  # the other surface parameters
+    # texels along an edge relative to the rest of the object, by tag, for parts that are hardly seen
     detail: Mapping[str, float] = field(default_factory=dict)
+    # of an object of several materials, what each tag is like; its tags are then names of materials
     finishes: Mapping[str, Material] = field(default_factory=dict)
-    rig: MeshRig | None = None
+    rig: MeshRig | None = None  # what moves the vertices of all patches, in the order of the patches
 
 
 @dataclass(frozen=True)
 class ObjectFamily:
-    """A class of objects whose members differ in proportions, texture and material.
+    """A class of objects whose members differ in proportions, texture and material."""
 
-    Attributes:
-        name: the class, usable on the command line.
-        make: builds an instance from a `Draw`.
-        metres: of the unit in which it is made.
-        texels: along each side of its texture.
-    """
-
-    name: str
-    make: Callable[[Draw], Instance]
-    metres: float
-    texels: int = SIZE
+    name: str  # the class, usable on the command line
+    make: Callable[[Draw], Instance]  # builds an instance from a `Draw`
+    metres: float  # of the unit in which it is made
+    texels: int = SIZE  # along each side of its texture
 
     @property
     def label(self) -> str:
@@ -185,16 +170,11 @@ class ObjectFamily:
             mesh = replace(mesh, materials=materials, rig=instance.rig)
         extent = np.ptp(np.concatenate([patch.vertices for patch in patches]), axis=0).max()
         return ObjectAsset(
-            name=self.name,
-            mesh=mesh,
-            base_color=painted(patches, charts, instance.paints, self.texels),
-            material=instance.material,
-            label=self.label,
-            source=BUNDLED_OBJECT,
+            name=self.name, mesh=mesh, base_color=painted(patches, charts, instance.paints, self.texels),
+            material=instance.material, label=self.label, source=BUNDLED_OBJECT,
             surface=finished(mesh, instance.finishes, instance.material) if instance.finishes else None,
-            finishes=instance.finishes,
-            metres=round(float(extent) * self.metres, 4),
-        )
+            finishes=instance.finishes, metres=round(float(extent) * self.metres, 4),
+        )  # fmt: skip
 
 
 def family(metres: float, texels: int = SIZE) -> Callable[[Callable[[Draw], Instance]], ObjectFamily]:
@@ -202,16 +182,10 @@ def family(metres: float, texels: int = SIZE) -> Callable[[Callable[[Draw], Inst
     return lambda make: ObjectFamily(make.__name__.replace("_", "-"), make, metres, texels)
 
 
-def finish(
-    draw: Draw, roughness: float, clearcoat: float = 0.0, metallic: float = 0.0, spread: float = 0.2
-) -> Material:
+def finish(draw: Draw, roughness: float, clearcoat: float = 0.0, spread: float = 0.2) -> Material:
     """Return a material near the given one: roughness within `spread`, and now and then another coat."""
     rough = min(max(draw(roughness, roughness - spread, roughness + spread), 0.12), 0.95)
     coat = draw(clearcoat, 0.0, 1.0) if draw.chance(0.3) else clearcoat
-    metal = draw(metallic, 0.3, 0.8) if draw.chance(0.06) else metallic
-    return Material(
-        roughness=round(rough, 4),
-        metallic=round(metal, 4),
-        specular=round(draw(0.5, 0.3, 0.7), 4),
-        clearcoat=round(coat, 4),
-    )
+    metal = draw(0.0, 0.3, 0.8) if draw.chance(0.06) else 0.0
+    numbers = {"roughness": rough, "metallic": metal, "specular": draw(0.5, 0.3, 0.7), "clearcoat": coat}
+    return Material(**{name: round(value, 4) for name, value in numbers.items()})

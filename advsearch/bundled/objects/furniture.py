@@ -77,11 +77,9 @@ def chair(draw: Draw) -> Instance:
 
     fabric = draw.colour("8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
     cover = draw.pick(
-        clouded(fabric, 0.8, 1.5, offset),
-        stripes(fabric, shade(fabric, 1.5), 6.0),
-        checks(fabric, hexed("efe6d4"), 4.0),
-        dots(solid(fabric), hexed("f4efe4"), 6.0),
-    )
+        clouded(fabric, 0.8, 1.5, offset), stripes(fabric, shade(fabric, 1.5), 6.0),
+        checks(fabric, hexed("efe6d4"), 4.0), dots(solid(fabric), hexed("f4efe4"), 6.0),
+    )  # fmt: skip
     seat_paint = cover if draw.chance(0.25) else grain(0)
     paints = {"up": grain(2), "along": grain(0), "cross": grain(1), "seat": seat_paint, "cushion": cover}
     return Instance(turned, paints, finish(draw, 0.45, 0.2))
@@ -90,7 +88,6 @@ def chair(draw: Draw) -> Instance:
 def _chair_back(
     draw: Draw, x: float, y: float, seat: float, total: float, lean: float, leg: float, section: Array
 ) -> list[Patch]:
-    """Two leaning posts with slats between them."""
     style = draw.pick("slats", "ladder", "panel", "arch")
     patches: list[Patch] = []
     foot = seat - 2.0
@@ -143,7 +140,6 @@ def _shade(draw: Draw, low: float, high: float, wide: float, narrow: float) -> l
 
 
 def _lamp_base(draw: Draw, style: str, low: float, radius: float, stem: float) -> list[Patch]:
-    """The foot and the stem, up to the height `low`."""
     under, top = [(0.0, 0.0), (radius - 0.4, 0.0)], [(stem, low), (0.0, low)]
     if style == "disc":
         thick = draw(2.0, 1.2, 3.2)
@@ -206,12 +202,7 @@ def lamp(draw: Draw) -> Instance:
     body = natural(draw, total, clouded(clay, 1.3, 4.0, offset), 0.35)
     metal = draw.colour("b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
     paints = {
-        "shade": cloth,
-        "rim": solid(shade(linen, 0.8)),
-        "lining": solid("f4f0e4"),
-        "bulb": solid("fbf6e6"),
-        "body": body,
-        "foot": solid(metal),
-        "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
-    }
+        "shade": cloth, "rim": solid(shade(linen, 0.8)), "lining": solid("f4f0e4"), "bulb": solid("fbf6e6"),
+        "body": body, "foot": solid(metal), "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
+    }  # fmt: skip
     return Instance(patches, paints, finish(draw, 0.4, 0.3), {"lining": 0.6})

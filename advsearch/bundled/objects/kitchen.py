@@ -73,11 +73,8 @@ def teapot(draw: Draw) -> Instance:
     )  # fmt: skip
     profile: list[tuple[str, Points]] = [
         ("base", [(0.0, 0.2), (foot * 0.8, 0.2), (foot * 0.86, 0.0), (foot * 0.97, 0.0)]),
-        ("body", [(foot * 0.97, 0.0), *side]),
-        ("body", rim),
-        ("lid", lid),
-        ("knob", [lid[-1], *knob]),
-    ]
+        ("body", [(foot * 0.97, 0.0), *side]), ("body", rim), ("lid", lid), ("knob", [lid[-1], *knob]),
+    ]  # fmt: skip
     body = shapes.lathe(profile, 56)
     span = draw(0.9, 0.75, 1.0)
     high, low = height * 0.84, height * (0.84 - 0.62 * span)
@@ -93,10 +90,8 @@ def teapot(draw: Draw) -> Instance:
     grip = shapes.sweep(
         "handle", shapes.upright(shapes.spline(knots, 26)), section, 1.0 + 0.2 * np.abs(np.linspace(-1, 1, 26)) ** 3
     )
-    patches = shapes.placed(
-        [*body, *_spout(draw, radius, height), *shapes.placed(grip, shapes.rotation("z", 180.0))],
-        shapes.rotation("z", 118.0),
-    )
+    patches = [*body, *_spout(draw, radius, height), *shapes.placed(grip, shapes.rotation("z", 180.0))]
+    patches = shapes.placed(patches, shapes.rotation("z", 118.0))
 
     offset = draw.offset()
     clay = draw.colour("7b2d26", "f2eee4", "2f5d7c", "3d5c47", "22262b", "c98a3a", "e7b9b0")
@@ -119,13 +114,9 @@ def teapot(draw: Draw) -> Instance:
     paint = natural(draw, height + 4.0, paint)
     trim = draw.pick(glaze, solid(second), paint)
     paints = {
-        "base": solid("a98663"),
-        "body": paint,
-        "lid": draw.pick(paint, trim),
-        "spout": draw.pick(glaze, paint),
-        "handle": draw.pick(glaze, trim),
-        "knob": solid(second) if draw.chance(0.5, True) else trim,
-    }
+        "base": solid("a98663"), "body": paint, "lid": draw.pick(paint, trim), "spout": draw.pick(glaze, paint),
+        "handle": draw.pick(glaze, trim), "knob": solid(second) if draw.chance(0.5, True) else trim,
+    }  # fmt: skip
     return Instance(patches, paints, finish(draw, 0.25, 0.7), {"base": 0.6})
 
 
@@ -149,11 +140,8 @@ def frying_pan(draw: Draw) -> Instance:
     section = shapes.ellipse(1.0, 1.0, 20) if draw.chance(0.5, True) else shapes.rectangle(2.0, 2.0, 0.7)
     grip = shapes.sweep("handle", path, section, scale)
     inner = shapes.at_height(side, 0.72 * depth) - wall
-    rivets = [
-        patch
-        for y in (-1.1, 1.1)
-        for patch in shapes.sphere("rivet", 0.38, (inner + 0.02, y, 0.72 * depth), rows=8, columns=12)
-    ]
+    rivet = shapes.sphere("rivet", 0.38, (inner + 0.02, 0.0, 0.72 * depth), rows=8, columns=12)
+    rivets = [patch for y in (-1.1, 1.1) for patch in shapes.placed(rivet, offset=(0.0, y, 0.0))]
     spine = [(rim - 1.4, 0.72 * depth), (rim - 0.3, 0.75 * depth), (rim + 0.2 * length, 0.78 * depth + 0.5 * rise)]
     bracket = shapes.sweep(
         "bracket", shapes.upright(np.array(spine)), shapes.rectangle(0.7, 3.0, 0.25), (1.0, 1.0, 0.62), caps=True

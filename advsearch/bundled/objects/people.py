@@ -13,13 +13,10 @@ from advsearch.scene.assets import Material, face_vectors
 from advsearch.scene.people import Person, body_data
 
 FINISHES = {
-    "shirt": Material(roughness=0.85, specular=0.2),
-    "trousers": Material(roughness=0.9, specular=0.2),
-    "skin": Material(roughness=0.5, specular=0.35),
-    "hair": Material(roughness=0.55, specular=0.3),
-    "shoes": Material(roughness=0.4),
-    "eyes": Material(roughness=0.1),
-}
+    "shirt": Material(roughness=0.85, specular=0.2), "trousers": Material(roughness=0.9, specular=0.2),
+    "skin": Material(roughness=0.5, specular=0.35), "hair": Material(roughness=0.55, specular=0.3),
+    "shoes": Material(roughness=0.4), "eyes": Material(roughness=0.1),
+}  # fmt: skip
 
 
 def _rest(charts: Array, points: Array) -> Rest:
@@ -67,7 +64,6 @@ def _woven(t: Texels, color: Array, depth: float) -> Array:
 
 @painter
 def _jeans(t: Texels, color: Array) -> Array:
-    """Woven cloth with seams at the sides and the hems."""
     x, _, z = t.xyz.T
     seam = np.where((z < 0.88) & (z > 0.08), np.minimum(np.abs(x - 0.005), 9.0), 9.0)
     hem = np.abs(z - 0.085)
@@ -76,7 +72,6 @@ def _jeans(t: Texels, color: Array) -> Array:
 
 @painter
 def _face(t: Texels, color: Array, hair: Array) -> Array:
-    """Skin, redder lips and cheeks, and eyebrows."""
     x, y, z = t.xyz.T
     aside, ahead = np.abs(y), x > 0.1
     skin = np.clip(color * (1.0 + 0.1 * (noise(t.xyz * 14.0) - 0.5))[:, None], 0.0, 1.0)
@@ -97,7 +92,6 @@ def _strands(t: Texels, color: Array) -> Array:
 
 @painter
 def _leather(t: Texels, color: Array) -> Array:
-    """Shoes with a pale sole."""
     return mix(color, hexed("cfcac0"), step(0.012 - t.xyz[:, 2], 0.0, 0.004))
 
 
@@ -114,13 +108,10 @@ def _irises(t: Texels, color: Array) -> Array:
 def person(draw: Draw) -> Instance:
     woman = draw.chance(0.5)
     about = {
-        "gender": 0.0 if woman else 1.0,
-        "height": draw(1.7, 1.52, 1.9) - (0.08 if woman else 0.0),
-        "weight": draw(0.5, 0.25, 0.8),
-        "age": draw(35.0, 16.0, 75.0),
-        "stride": draw(0.0, 0.0, 1.2),
+        "gender": 0.0 if woman else 1.0, "height": draw(1.7, 1.52, 1.9) - (0.08 if woman else 0.0),
+        "weight": draw(0.5, 0.25, 0.8), "age": draw(35.0, 16.0, 75.0), "stride": draw(0.0, 0.0, 1.2),
         "walk": draw(0.0, 0.0, 360.0),
-    }
+    }  # fmt: skip
     body = Person(body_data(), about)
     skin = hexed(draw.pick("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4"))
     hair = hexed(draw.pick("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c"))

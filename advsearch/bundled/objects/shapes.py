@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicHermiteSpline, RegularGridInterpolator
 
-from advsearch.scene.assets import face_vectors
+from advsearch.scene.assets import Bools, Ints, face_vectors
 
 # ---- Plane and space curves from which the bundled objects are made. Float64; lengths in the object's units ---------
 
@@ -69,18 +69,12 @@ def spline(points: Points, count: int) -> Array:
     """Return `count` points of the Catmull-Rom curve (chord-length knots) through (K, D) points, ends included."""
     knots = np.asarray(points, dtype=np.float64)
     at = lengths(knots)
-    curve: Array = CubicHermiteSpline(at, knots, np.gradient(knots, at, axis=0))(np.linspace(0.0, at[-1], count))
-    return curve
+    return np.asarray(CubicHermiteSpline(at, knots, np.gradient(knots, at, axis=0))(np.linspace(0.0, at[-1], count)))
 
 
 def rounded(corners: Points, radius: float | Sequence[float], steps: int = 5) -> Array:
-    """Return the open polyline (K, D) with its inner corners rounded off.
-
-    Args:
-        corners: the polyline.
-        radius: how far from each inner corner the rounding starts, one number or K - 2 of them; at most half an edge.
-        steps: edges per rounding.
-    """
+    """Return the open polyline (K, D) with its inner corners rounded off, from a distance on, one number or K - 2 of
+    them and at most half an edge, in so many steps."""
     points = np.asarray(corners, dtype=np.float64)
     radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), (max(len(points) - 2, 0),))
     out = [points[0]]
@@ -127,44 +121,29 @@ def ellipse(width: float, height: float, count: int = 20) -> Array:
     return np.stack([width * np.cos(t), height * np.sin(t)], axis=1)
 
 
-Indices = npt.NDArray[np.int64]
 Rest = Callable[[Array, Array], Array]
-
 HARD_ANGLE = 40.0  # degrees; where two parts of a profile meet at more than this, the edge stays hard
 
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A piece of surface with one chart.
+    """A piece of surface with one chart."""
 
-    Attributes:
-        tag: which paint it gets; any string. So it is in all functions here.
-        vertices: (V, 3) positions.
-        normals: (V, 3) unit normals, outwards.
-        uvs: (V, 2) chart coordinates in [0, 1].
-        faces: (F, 3) vertex indices.
-        size: width and height of the chart, in object units; its share of the atlas follows from it.
-        rest: maps (N,) u and (N,) v to the (N, 3) surface points as they were before `placed`.
-    """
-
-    tag: str
-    vertices: Array
-    normals: Array
-    uvs: Array
-    faces: Indices
-    size: tuple[float, float]
-    rest: Rest
+    tag: str  # which paint it gets; any string. So it is in all functions here.
+    vertices: Array  # (V, 3) positions
+    normals: Array  # (V, 3) unit normals, outwards
+    uvs: Array  # (V, 2) chart coordinates in [0, 1]
+    faces: Ints  # (F, 3) vertex indices
+    size: tuple[float, float]  # width and height of the chart, in object units; its share of the atlas follows from it
+    rest: Rest  # maps (N,) u and (N,) v to the (N, 3) surface points as they were before `placed`
 
 
 def placed(
     patches: Iterable[Patch], rotation: Array | None = None, offset: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> list[Patch]:
     """Rotate patches by a (3, 3) rotation, then move them. What is painted on them moves along."""
-    turn = np.eye(3) if rotation is None else rotation
-    return [
-        replace(p, vertices=p.vertices @ turn.T + np.asarray(offset, dtype=np.float64), normals=p.normals @ turn.T)
-        for p in patches
-    ]
+    turn, move = np.eye(3) if rotation is None else rotation, np.asarray(offset, dtype=np.float64)
+    return [replace(p, vertices=p.vertices @ turn.T + move, normals=p.normals @ turn.T) for p in patches]
 
 
 def stretched(patches: Iterable[Patch], factors: Sequence[float] | Array) -> list[Patch]:
@@ -173,19 +152,9 @@ def stretched(patches: Iterable[Patch], factors: Sequence[float] | Array) -> lis
     return [replace(p, vertices=p.vertices * by, normals=unit(p.normals / by)) for p in patches]
 
 
-# ------------------------------------------------------------------------------------------------ grid patches
-
-
 def grid(tag: str, points: Array, normals: Array, size: tuple[float, float], down: Array, across: Array) -> Patch:
-    """Return the patch over a grid of points: u runs along columns, v along rows, du x dv points outwards.
-
-    Args:
-        points: (R, C, 3) positions.
-        normals: (R, C, 3) unit normals.
-        size: chart width and height.
-        down: (R,) increasing v of the rows, 0 to 1.
-        across: (C,) increasing u of the columns, 0 to 1.
-    """
+    """Return the patch over a grid of points (R, C, 3) with unit normals: u runs along columns, v along rows, du x dv
+    points outwards; `down` (R,) and `across` (C,) are the rows' v and the columns' u, which increase from 0 to 1."""
     rows, columns = points.shape[:2]
     u, v = np.broadcast_to(across, (rows, columns)), np.broadcast_to(down[:, None], (rows, columns))
 
@@ -208,13 +177,10 @@ def _along(curve: Array) -> tuple[Array, float]:
     return at / at[-1], float(at[-1])
 
 
-def _fan(count: int) -> Indices:
+def _fan(count: int) -> Ints:
     """The faces (count, 3) between a middle, which is vertex 0, and a ring of `count` vertices after it."""
     j = np.arange(count)
     return np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % count], axis=1).astype(np.int64)
-
-
-# ----------------------------------------------------------------------------------------- surfaces of revolution
 
 
 def _profile_normals(parts: Sequence[Array]) -> list[Array]:
@@ -304,16 +270,9 @@ def lathe(profile: Sequence[tuple[str, Points]], columns: int = 56) -> list[Patc
 
 
 def vessel(outside: Array, wall: float, floor: float, *, columns: int = 56, step: float = 0.7) -> list[Patch]:
-    """An open container: an "outside" profile with a rounded lip, an "inside" at constant wall thickness with a floor,
-    and a "base".
-
-    Args:
-        outside: (K, 2) profile (r, z) from the foot (z about 0, r > 0) up to the lip.
-        wall: thickness of the wall.
-        floor: height of the inside's floor.
-        columns: faces around.
-        step: longest edge along the profile.
-    """
+    """An open container: an "outside" profile (K, 2) of (r, z) from the foot (z about 0, r > 0) up to the lip, which is
+    rounded, an "inside" at constant wall thickness with a floor at a height, and a "base"; with so many faces around,
+    and a longest edge along the profile."""
     normal = _profile_normals([outside])[0]
     inner, keep = outside - wall * normal, np.arange(len(outside))
     while len(keep) > 2:  # points at which it runs backwards, as in tight bends, go; the last one stays
@@ -355,16 +314,9 @@ def sphere(
     return placed(lathe(pieces, columns), offset=centre)
 
 
-# --------------------------------------------------------------------------------------------- sweeps and boxes
-
-
 def frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
-    """Return unit tangents and two normals (N, 3) each along a path, turning as little as possible.
-
-    Args:
-        path: (N, 3) points.
-        first: a vector, not along the path, whose part across it is the first normal at the start.
-    """
+    """Return unit tangents and two normals (N, 3) each along a path (N, 3), turning as little as possible; `first` is a
+    vector, not along the path, whose part across it is the first normal at the start."""
     tangent = unit(np.gradient(path, axis=0))
     normal = np.empty_like(path)
     current = np.asarray(first, dtype=np.float64)
@@ -384,11 +336,10 @@ def sweep(
     caps: bool = False,
     frame: tuple[Array, Array, Array] | None = None,
 ) -> list[Patch]:
-    """Move a closed section along a path.
+    """Move a closed section along a path (N, 3).
 
     Args:
-        path: (N, 3) centres.
-        section: (M, 2) closed section, counter-clockwise, coordinates along the first and second normal.
+        section: (M, 2) counter-clockwise, coordinates along the first and second normal.
         scale: one number, (N,) or (N, 2): the section's scale at each centre; 0 closes the surface in a point.
         first: where the section's first axis points at the start.
         caps: close both ends with flat faces and a hard edge.
@@ -434,8 +385,7 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
     vertices = np.concatenate([centre[None], ring])
 
     def rest(u: Array, v: Array) -> Array:
-        places: Array = centre + (u * span[0] + low[0])[:, None] * x + (v * span[1] + low[1])[:, None] * y
-        return places
+        return np.asarray(centre + (u * span[0] + low[0])[:, None] * x + (v * span[1] + low[1])[:, None] * y)
 
     size = (float(span[0]), float(span[1]))
     return Patch(tag, vertices, np.tile(normal, (len(vertices), 1)), uvs, _fan(len(ring)), size, rest)
@@ -444,15 +394,8 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
 def box(
     tag: str, centre: Sequence[float], size: Sequence[float], bevel: float, steps: int = 2, cells: int = 1
 ) -> list[Patch]:
-    """A box with rounded edges and corners: six charts, smooth normals.
-
-    Args:
-        centre: its middle.
-        size: full extent along x, y and z.
-        bevel: radius of the edges.
-        steps: cells across half an edge's rounding.
-        cells: cells across the flat part of a face, each way.
-    """
+    """A box with edges and corners rounded by a radius: six charts, smooth normals, cells across half an edge's
+    rounding (`steps`) and across the flat part of a face, each way."""
     half = np.asarray(size, dtype=np.float64) / 2
     bevel = min(bevel, 0.95 * float(half.min()))
     core = half - bevel
@@ -487,22 +430,13 @@ def box(
 # A curve is where a function of the surface's points is zero. Triangles that it crosses are split there, so that the
 # edge is as smooth as the function and not as coarse as the grid.
 
-Bools = npt.NDArray[np.bool_]
 
-Field = Callable[[Array], Array]
-"""(N, 3) points to (N,) values, positive inside; about the distance to the edge."""
-
+Field = Callable[[Array], Array]  # (N, 3) points to (N,) values, positive inside; about the distance to the edge
 SNAP = 0.1  # share of an edge within which a cut goes through the edge's end: thinner slivers are not worth a triangle
 
 
 def carved(patches: Iterable[Patch], inside: Field, tag: str | None) -> list[Patch]:
-    """Return patches with what lies inside as patches of their own.
-
-    Args:
-        patches: smooth surfaces, before they are placed.
-        inside: where to carve.
-        tag: what is carved out becomes this; None leaves it out.
-    """
+    """Return patches, smooth and not placed yet, with what lies inside under a tag of its own; None leaves it out."""
     pieces = []
     for patch in patches:
         edges, value = _edges(patch), np.array(inside(patch.vertices))
@@ -529,11 +463,9 @@ def cropped(patch: Patch) -> Patch:
     return replace(patch, uvs=uvs, size=size, rest=lambda u, v: patch.rest(low[0] + u * span[0], low[1] + v * span[1]))
 
 
-def _edges(patch: Patch) -> Indices:
-    """The (E, 2) edges of a patch."""
+def _edges(patch: Patch) -> Ints:
     pairs = np.concatenate([patch.faces[:, [0, 1]], patch.faces[:, [1, 2]], patch.faces[:, [2, 0]]])
-    edges: Indices = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
-    return edges
+    return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64))
 
 
 def _split(patch: Patch, value: Array) -> tuple[Patch, Bools]:

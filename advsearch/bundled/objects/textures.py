@@ -13,9 +13,10 @@ from functools import wraps
 from typing import Concatenate, ParamSpec
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from advsearch.bundled.objects.draw import Color, Draw, hexed
-from advsearch.bundled.objects.shapes import Array, Indices
+from advsearch.bundled.objects.shapes import Array
 
 Options = ParamSpec("Options")
 
@@ -35,8 +36,7 @@ Mask = Callable[[Texels], Array]  # (N,) weights in [0, 1]
 
 
 def painter(paint: Callable[Concatenate[Texels, Options], Array]) -> Callable[Options, Paint]:
-    """Make of a function of texels and of what it paints there one of the latter alone, which returns the paint (or the
-    mask)."""
+    """Make of a function of texels and options one of the options alone, which returns the paint (or the mask)."""
 
     @wraps(paint)
     def with_options(*args: Options.args, **kwargs: Options.kwargs) -> Paint:
@@ -50,33 +50,15 @@ def shade(color: Color, factor: float) -> Color:
     return np.clip(color * factor, 0.0, 1.0)
 
 
-# ------------------------------------------------------------------------------------------------------ noise
-
-_CELLS = 16
-_LATTICE = np.random.Generator(np.random.PCG64(20)).random(_CELLS**3)
+_LATTICE = np.random.Generator(np.random.PCG64(20)).random((16, 16, 16))
 
 
 def noise(points: Array) -> Array:
     """Value noise: (N, 3) points to (N,) values in [0, 1], smooth at a scale of 1, period 16 along each axis."""
     cell = np.floor(points)
-    f = points - cell
-    f = f * f * (3.0 - 2.0 * f)
-    low = cell.astype(np.int64) & (_CELLS - 1)
-    high = (low + 1) & (_CELLS - 1)
-    x0, x1 = low[:, 0] * _CELLS * _CELLS, high[:, 0] * _CELLS * _CELLS
-    y0, y1 = low[:, 1] * _CELLS, high[:, 1] * _CELLS
-    z0, z1 = low[:, 2], high[:, 2]
-    fx, fy, fz = f[:, 0], f[:, 1], f[:, 2]
-
-    def line(xy: Indices) -> Array:
-        start = _LATTICE[xy + z0]
-        return start + (_LATTICE[xy + z1] - start) * fz
-
-    near = line(x0 + y0)
-    near += (line(x0 + y1) - near) * fy
-    far = line(x1 + y0)
-    far += (line(x1 + y1) - far) * fy
-    return near + (far - near) * fx
+    share = points - cell
+    smooth = cell + share * share * (3.0 - 2.0 * share)
+    return np.asarray(map_coordinates(_LATTICE, smooth.T, order=1, mode="grid-wrap"))
 
 
 def mix(a: Array, b: Array, weight: Array) -> Array:
@@ -92,9 +74,6 @@ def within(value: Array, low: float, high: float, soft: float) -> Array:
 def step(value: Array, edge: float, soft: float) -> Array:
     """Return 0 below the edge and 1 above it, with a ramp `soft` wide."""
     return np.clip((value - edge) / soft + 0.5, 0.0, 1.0)
-
-
-# ------------------------------------------------------------------------------------------------------ paints
 
 
 @painter
@@ -214,12 +193,8 @@ def facing(t: Texels, degrees: float, half_width: float, low: float, high: float
 
 
 def anything(draw: Draw, size: float) -> Paint:
-    """A paint of any kind in any colours, for instances whose texture says nothing about their class.
-
-    Args:
-        draw: must hold a generator.
-        size: about the size of the object, in its units.
-    """
+    """A paint of any kind in any colours, for instances whose texture says nothing about their class, and which are
+    about so large; `draw` must hold a generator."""
     a, b = draw.colour("808080", wild=1.0), draw.colour("808080", wild=1.0)
     cell = size * draw(0.1, 0.05, 0.2)
     at = draw.offset()

@@ -28,8 +28,6 @@ from advsearch.bundled.objects.textures import (
 )
 from advsearch.scene.assets import Material
 
-# -------------------------------------------------------------------------------------------------------- ball
-
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
 _SIGNS = ((a, b) for a in (-1.0, 1.0) for b in (-_GOLDEN, _GOLDEN))
 PENTAGONS = shapes.unit(np.array([corner for a, b in _SIGNS for corner in ((0.0, a, b), (a, b, 0.0), (b, 0.0, a))]))
@@ -74,7 +72,6 @@ def _football(t: Texels, light: Array, dark: Array, offset: Array) -> Array:
 
 @painter
 def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array:
-    """Panels between the poles, which are light."""
     angle = np.arctan2(t.xyz[:, 1], t.xyz[:, 0]) / (2 * np.pi) % 1.0
     pole = np.abs(t.xyz[:, 2]) > 0.955 * radius
     return np.where(pole[:, None], light, np.array(colors)[np.minimum((angle * 6).astype(np.int64), 5)])
@@ -82,7 +79,6 @@ def _beach(t: Texels, colors: list[Array], light: Array, radius: float) -> Array
 
 @painter
 def _near_to(t: Texels, seam: Callable[[Array], Array], reach: float) -> Array:
-    """1 within so far of a seam."""
     return step(-seam(shapes.unit(t.xyz)), -reach, 0.02)
 
 
@@ -138,10 +134,8 @@ def banana(draw: Draw) -> Instance:
     body = np.clip((at - stem) / (0.26 * length), 0.0, 1.0) ** 0.75
     taper = np.clip((length - at) / (0.24 * length), 0.0, 1.0) ** 0.62
     neck = draw(0.3, 0.24, 0.4)
-    radius = thick * np.maximum(
-        neck * (1.0 + 0.25 * np.exp(-at / 0.5)),
-        np.sin(0.5 * np.pi * body) * np.maximum(np.sin(0.5 * np.pi * taper), 0.26),
-    )
+    full = np.sin(0.5 * np.pi * body) * np.maximum(np.sin(0.5 * np.pi * taper), 0.26)
+    radius = thick * np.maximum(neck * (1.0 + 0.25 * np.exp(-at / 0.5)), full)
     radius = np.convolve(np.pad(radius, 2, mode="edge"), np.ones(5) / 5, mode="valid")
     ridge = draw(0.06, 0.02, 0.1)
     phi = 2 * np.pi * np.arange(30) / 30
@@ -163,10 +157,8 @@ def banana(draw: Draw) -> Instance:
         base = mix(skin, shade(skin, 0.86), noise(xyz / 2.2 + offset))
         base = mix(base, green, np.clip(1.0 - (start - 0.9 * stem) / 2.6, 0.0, 1.0) * 0.75)
         base = mix(base, green, np.clip(1.0 - end / 2.2, 0.0, 1.0) * 0.5)
-        fleck = np.maximum(
-            step(noise(xyz * np.array([1.9, 1.9, 3.1]) + offset), 1.0 - amount, 0.08),
-            step(noise(xyz * 3.7 + offset), 1.02 - amount, 0.08),
-        )
+        fleck = step(noise(xyz * np.array([1.9, 1.9, 3.1]) + offset), 1.0 - amount, 0.08)
+        fleck = np.maximum(fleck, step(noise(xyz * 3.7 + offset), 1.02 - amount, 0.08))
         base = mix(base, brown, fleck * 0.85)
         base = mix(base, brown, step(-start, -0.5 * stem, 1.3) * 0.5)
         base = mix(base, tip, step(-start, -0.45, 0.5))
@@ -204,8 +196,7 @@ def book(draw: Draw) -> Instance:
 
     def pages_paint(t: Texels) -> Array:
         lines = noise(np.stack([t.xyz[:, 2] * 9.0, 0.08 * t.xyz[:, 0], 0.08 * t.xyz[:, 1]], axis=1) + offset)
-        pages: Array = paper * (0.72 + 0.28 * lines)[:, None]
-        return pages
+        return np.asarray(paper * (0.72 + 0.28 * lines)[:, None])
 
     def spine(t: Texels) -> Array:
         y = np.abs(t.xyz[:, 1]) / height
@@ -234,7 +225,6 @@ def _spine(outer: Array, inner: Array, height: float) -> list[Patch]:
 
 
 def _front(draw: Draw, base: Paint, gold: Array, title: str, width: float, height: float, thick: float) -> Paint:
-    """What is stamped or printed on the front cover."""
     accent = draw.colour("c9a24b", "2f6f8f", "b5442e", "3d6b4a")
 
     def inside(x: Array, y: Array, w: float, h: float) -> Array:
@@ -280,14 +270,10 @@ _STROKES = {  # letters in a cell 1 high and 0.6 wide: runs of points (x, y)
            (0.02, 0.2)]],
     "P": [[(0.04, 0.0), (0.04, 0.97), (0.46, 0.97), (0.58, 0.85), (0.58, 0.58), (0.46, 0.46), (0.04, 0.46)]],
 }  # fmt: skip
-
-
 FINISHES = {
-    "face": Material(roughness=0.35, clearcoat=0.4),
-    "metal": Material(roughness=0.5, metallic=0.6),
-    "post": Material(roughness=0.45, metallic=0.7),
-    "rubber": Material(roughness=0.85),
-}
+    "face": Material(roughness=0.35, clearcoat=0.4), "metal": Material(roughness=0.5, metallic=0.6),
+    "post": Material(roughness=0.45, metallic=0.7), "rubber": Material(roughness=0.85),
+}  # fmt: skip
 
 
 @painter
@@ -319,10 +305,8 @@ def stop_sign(draw: Draw) -> Instance:
     plate = shapes.placed(plate, offset=(0.036, 0.0, height))
     tube = shapes.rounded([(0.03, 0.0), (0.03, height + 0.7 * radius), (0.0, height + 0.7 * radius + 0.004)], 0.004, 2)
     post = shapes.lathe([("post", [(0.0, 0.0), (0.03, 0.0)]), ("post", tube[:-1]), ("post", tube[-2:])], 20)
-    foot = [
-        *shapes.box("rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), 0.02, 2),
-        *shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), 0.01, 1),
-    ]
+    foot = shapes.box("rubber", (0.0, 0.0, 0.03), (0.6, 0.36, 0.06), 0.02, 2)
+    foot += shapes.box("post", (0, 0, 0.07), (0.1, 0.1, 0.05), 0.01, 1)
     heights = (height - 0.5 * radius, height + 0.5 * radius)
     clamps = [patch for z in heights for patch in shapes.box("post", (0.008, 0.0, z), (0.05, 0.09, 0.03), 0.006, 1)]
     grey = draw.colour("9a9da0", "7d8083", wild=0.0)

@@ -39,7 +39,6 @@ def _claw(draw: Draw, half: float, start: float, length: float, drop: float) -> 
 
 
 def _along_y(*places: float) -> Array:
-    """A path along y."""
     return np.array([(0.0, place, 0.0) for place in places])
 
 

@@ -34,17 +34,8 @@ BACK = shapes.rotation("z", 220.0)  # turns the seam of a lathe away from the de
 
 
 def handle(draw: Draw, style: str, low: float, high: float, reach: float, profile: Array, inset: float) -> list[Patch]:
-    """A handle in the x-z plane, on the +x side.
-
-    Args:
-        draw: thickness of the strap.
-        style: "round", "ear" (widest at the top), "square" or "loop" (small and central).
-        low: height of its lower root.
-        high: height of its upper root.
-        reach: how far it stands out from the wall.
-        profile: (K, 2) of the wall that it stands on.
-        inset: how deep in the wall its roots are.
-    """
+    """A handle in the x-z plane, on the +x side of a wall with a profile (K, 2), that reaches so far out between the
+    heights of its roots, inset in the wall: "round", "ear" (widest at the top), "square" or "loop" (small)."""
     at_low, at_high = (shapes.at_height(profile, z) - inset for z in (low, high))
     edge = max(at_low, at_high)
     if style == "square":
@@ -61,11 +52,9 @@ def handle(draw: Draw, style: str, low: float, high: float, reach: float, profil
         curve = shapes.spline(knots, 26)
     thick, broad = draw(0.42, 0.32, 0.6), draw(0.62, 0.4, 0.95)
     flare = 1.0 + 0.25 * np.abs(np.linspace(-1.0, 1.0, len(curve))) ** 4
-    section = (
-        shapes.ellipse(thick, broad, 16)
-        if draw.chance(0.7, True)
-        else shapes.rectangle(2 * thick, 2 * broad, 0.6 * thick)
-    )
+    section = shapes.ellipse(thick, broad, 16)
+    if not draw.chance(0.7, True):
+        section = shapes.rectangle(2 * thick, 2 * broad, 0.6 * thick)
     return shapes.sweep("handle", shapes.upright(curve), section, flare)
 
 
@@ -124,10 +113,8 @@ def mug(draw: Draw) -> Instance:
     raw = solid("a98663")
     paints = {
         "outside": over(outer, between(-1.0, 0.35, soft=0.1), raw) if draw.chance(0.4, True) else outer,
-        "inside": inner,
-        "base": raw,
-        "handle": draw.pick(glaze, outer, accent),
-    }
+        "inside": inner, "base": raw, "handle": draw.pick(glaze, outer, accent),
+    }  # fmt: skip
     patches = shapes.placed([*body, *shapes.placed(grip, shapes.rotation("z", -108.0))], BACK)
     return Instance(patches, paints, finish(draw, 0.3, 0.5), {"inside": 0.8, "base": 0.6})
 
@@ -194,16 +181,13 @@ def bottle(draw: Draw) -> Instance:
     if draw.chance(0.5, True):
         outer = over(outer, between(height * 0.8, 2 * height), speckled(solid(foil), shade(foil, 1.3), 0.5, offset))
     paints = {
-        "outside": outer,
-        "inside": solid(shade(glass, 0.6)),
-        "base": solid(glass),
+        "outside": outer, "inside": solid(shade(glass, 0.6)), "base": solid(glass),
         "cap": solid(draw.colour("c9a24b", "d0d0d0", "b5442e", "22262b")),
-    }
+    }  # fmt: skip
     return Instance(shapes.placed(patches, BACK), paints, finish(draw, 0.2, 0.6), {"inside": 0.25, "base": 0.5})
 
 
 def _cap(draw: Draw, radius: float, height: float) -> list[Patch]:
-    """A screw cap or crown over the mouth."""
     low, top = height - draw(1.5, 0.9, 2.2), height + 0.35
     under = np.array([[0.6 * radius, low], [radius, low]])
     side = shapes.rounded([(radius, low), (radius, top), (0.6 * radius, top)], 0.3, 4)
@@ -309,12 +293,10 @@ def wine_glass(draw: Draw) -> Instance:
     floor = stem_top + 0.08 * deep
     edge = (inner[-1, 0] * 0.6, floor + 0.25 * (inner[-1, 1] - floor))
     profile = [
-        ("foot", shapes.dense(under, 1.5)),
-        ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, 14)])),
-        ("bowl", np.concatenate([outer, lip, inner[:1]])),
-        ("inside", inner),
+        ("foot", shapes.dense(under, 1.5)), ("foot", np.array([under[-1], (foot, 0.08), *shapes.spline(rising, 14)])),
+        ("bowl", np.concatenate([outer, lip, inner[:1]])), ("inside", inner),
         ("inside", np.array([inner[-1], edge, (0.0, floor)])),
-    ]
+    ]  # fmt: skip
     body = shapes.lathe(profile, 52)
     height = stem_top + deep
     tint = draw.colour("c4dbe2", "d9e4e6", "e8d9c8", "8fb8a8", "c58a94", "7c9cc4", "f0f0ee", wild=0.3)

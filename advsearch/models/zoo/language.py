@@ -10,9 +10,8 @@ import inspect
 import sys
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from itertools import permutations
 from typing import Any
 
@@ -23,7 +22,7 @@ from torch import Tensor, nn
 from advsearch.errors import InputError, ModelError
 from advsearch.models.model import warn
 from advsearch.models.probe import foreign
-from advsearch.models.source import Purpose, Source, source_of
+from advsearch.models.source import Source, source_of
 from advsearch.models.zoo.library import Loaded, Processing, measured, nearly
 from advsearch.models.zoo.zero_shot import spoken
 
@@ -47,8 +46,9 @@ def speaks(architecture: str, network: Any) -> bool:
 
 
 def source(loaded: Loaded) -> Source:
-    """Return the source of a network that is finished when names are there, or a free answer is asked for. Raises
-    ModelError where it has an encoder for texts of its own, or its processor can't be had."""
+    """Return the source of a classifier of the names that are given, or of free answers. Raises ModelError where the
+    network has an encoder for texts of its own, its processor can't be had, or it goes on otherwise than is read
+    here."""
     if getattr(loaded.network.config, "is_encoder_decoder", False):
         raise _another(loaded, "reads from an encoder of its own")
     try:
@@ -60,147 +60,42 @@ def source(loaded: Loaded) -> Source:
                 "that, which is not installed: pip install 'advsearch[torchvision]'"
             ) from error
         raise
-    return Source(loaded.network, loaded.name, finish=partial(_asked, loaded, processor), reads_text=True)
-
-
-def _asked(loaded: Loaded, processor: Any, purpose: Purpose) -> Source:
-    purpose.check(loaded.name, "goes on in words", "classification", "answer")
-    free, names = purpose.is_free(), purpose.names
+    purpose, name = loaded.purpose, loaded.name
+    (free, question), names = purpose.in_words(name, "goes on in words"), purpose.names
     if not free and (names is None or len(names) < 2):
         raise InputError(
-            f"labels: expected two names at least, such as mug,cup,bowl, of which model {loaded.name} chooses one, got "
+            f"labels: expected two names at least, such as mug,cup,bowl, of which model {name} chooses one, got "
             f"{'none' if names is None else repr(names[0])}; with `task=answer` it answers freely"
         )
-    question = purpose.one_prompt(loaded.name) or QUESTION
     kind = type(loaded.network).__name__
     with foreign(f"model {loaded.spec}: is a {kind}, which can't be asked about a picture as LLaVA can"):
-        text = _written(processor, question)
-        pixels, described = _pictures(loaded, processor, text)
-        reader = _Speaker(loaded.network, partial(_inputs, processor, text), pixels)
-        side = described.get("input_size", (SIDE, SIDE))
-        prompt = reader.prompt(side)["input_ids"][0].tolist()
-        tokens = _tokens(processor, text, prompt, names or (CHECKED,), side)
+        reader = _Speaker(loaded, processor, question or QUESTION)
+        tokens = reader.tokens_of(names or (CHECKED,))
         most = getattr(loaded.network.config.get_text_config(), "max_position_embeddings", None)
-        length = len(prompt) + max(purpose.tokens if free else 0, *map(len, tokens))
+        length = reader.prompt(reader.side)["input_ids"].shape[1]
+        length += max(purpose.tokens if free else 0, *map(len, tokens))
         if isinstance(most, int) and length > most:
             raise InputError(
-                f"prompt: expected picture, prompt and name to have at most {most} tokens for model {loaded.name}, "
+                f"prompt: expected picture, prompt and name to have at most {most} tokens for model {name}, "
                 f"got {length}"
             )
         named = _Named(reader, tokens)
-        module = _Free(reader, processor.tokenizer, _ends(loaded.network), purpose.tokens) if free else named
+        module = _Free(reader, purpose.tokens) if free else named
         with torch.no_grad():
-            _check(loaded, named, side)
+            _check(loaded, named)
             begun = time.perf_counter()
-            module(torch.zeros((1, 3, *side)))
+            module(torch.zeros((1, 3, *reader.side)))
             seconds = time.perf_counter() - begun
     if names is not None:
-        _say_what_begins_another(tokens, names, loaded.name)
+        _say_what_begins_another(tokens, names, name)
     weights = list(loaded.network.parameters())
     if (count := sum(tensor.numel() for tensor in weights)) >= LARGE:
         size = sum(tensor.nbytes for tensor in weights)
         warn(
-            f"model {loaded.name} has {count / 1e9:.3g} billion weights, {size / 1e9:.3g} GB, and took {seconds:.2g} s "
+            f"model {name} has {count / 1e9:.3g} billion weights, {size / 1e9:.3g} GB, and took {seconds:.2g} s "
             "to answer one picture here; a gradient takes longer"
         )
-    return source_of(module, loaded.name, labels=names, batch_limits=(1, 1), **described)
-
-
-# ---- picture and prompt ---------------------------------------------------------------------------------------------
-
-
-def _written(processor: Any, question: str) -> str:
-    """Return the question with a place for the picture, as the network was trained on it: by its chat template."""
-    if getattr(processor, "chat_template", None):
-        content = [{"type": "image"}, {"type": "text", "text": question}]
-        text: str = processor.apply_chat_template([{"role": "user", "content": content}], add_generation_prompt=True)
-        return text
-    return f"{getattr(processor, 'image_token', None) or ''}{question}"
-
-
-def _inputs(processor: Any, text: str, picture: Any, **options: Any) -> dict[str, Tensor]:
-    """Return what the processor makes of a picture and a text, without what is for training."""
-    with warnings.catch_warnings():  # of how the library reads arrays
-        warnings.simplefilter("ignore")
-        given = processor(images=[picture], text=[text], return_tensors="pt", **options)
-    return {key: value for key, value in given.items() if isinstance(value, Tensor) and key != "labels"}
-
-
-Pixels = Callable[[Tensor], Tensor]
-
-
-def _pictures(loaded: Loaded, processor: Any, text: str) -> tuple[Pixels, Processing]:
-    """Return what makes ``pixel_values`` of a picture (3, H, W), and what `Preprocessing` does before. An affine map is
-    measured and left to that. What cuts a picture into patches or tiles is called itself, which is differentiable where
-    the processor works with torchvision."""
-    side = getattr(getattr(loaded.network.config, "vision_config", None), "image_size", None) or SIDE
-    side = (int(side[0]), int(side[1])) if isinstance(side, (list, tuple)) else (int(side), int(side))
-    described = Processing()
-    with suppress(ModelError):  # it is called then
-        described = measured(lambda **given: processor(text=[text], **given), loaded.spec)
-    if "mean" in described:
-        described["input_size"] = described.get("input_size", side)
-        pixels: Pixels = lambda image: image[None]  # noqa: E731
-    elif importlib.util.find_spec("torchvision") is None:
-        raise ModelError(
-            f"model {loaded.spec}: its processor cuts pictures into patches or tiles, and lets gradients through with "
-            "torchvision only, which is not installed: pip install 'advsearch[torchvision]'"
-        )
-    else:
-        described, pixels = Processing(input_size=side), partial(_called, processor, text)
-    _check_pixels(loaded, processor, text, pixels, described)
-    return pixels, described
-
-
-def _called(processor: Any, text: str, image: Tensor) -> Tensor:
-    return _inputs(processor, text, image.float(), do_rescale=False)["pixel_values"]
-
-
-def _check_pixels(loaded: Loaded, processor: Any, text: str, pixels: Pixels, described: Processing) -> None:
-    """Raise a ModelError where a picture of slopes arrives otherwise than from 8-bit values by the processor."""
-    height, width = described["input_size"]
-    down, across = torch.linspace(0, 200, height)[:, None], torch.linspace(0, 200, width)
-    levels = torch.stack([(down + 0 * across), (across + 0 * down), (down + across) / 4 + 100]).round()
-    theirs = _inputs(processor, text, np.ascontiguousarray(levels.byte().permute(1, 2, 0).numpy()))["pixel_values"]
-    image = levels / 255.0
-    if "mean" in described:
-        mean, std = (image.new_tensor(described[key]).view(3, 1, 1) for key in ("mean", "std"))
-        image = ((image if described["channels"] == "RGB" else image.flip(0)) - mean) / std
-    ours = pixels(image)
-    off = float((ours - theirs).abs().max()) if ours.shape == theirs.shape else float("inf")
-    if not off <= LEVELS * float(theirs.abs().max()):
-        raise ModelError(
-            f"model {loaded.spec}: its processor {type(processor).__name__} does something else to numbers than to "
-            "8-bit pictures. Wrap network and processing in an nn.Module of yours, and give that from Python"
-        )
-
-
-# ---- names ----------------------------------------------------------------------------------------------------------
-
-
-def _tokens(
-    processor: Any, text: str, prompt: Sequence[int], names: Sequence[str], side: tuple[int, int]
-) -> list[list[int]]:
-    """Return the tokens of each name where it follows the prompt, with a blank between them unless one is there. They
-    are those that the whole text has more than the prompt; where it does not begin with the prompt's, as a processor
-    may end a text with a line's end, those of the name alone."""
-    tokenizer = processor.tokenizer
-    gap = "" if text[-1:].isspace() or prompt[-1] in tokenizer.all_special_ids else " "
-    grey = np.full((*side, 3), 128, np.uint8)
-    begun = tokenizer(text, verbose=False)["input_ids"]
-    words = spoken(names)
-    # whether what the processor adds stands before or behind
-    processed = _inputs(processor, f"{text}{gap}{words[0]}", grey)["input_ids"][0].tolist()
-    joined = processed[: len(prompt)] == list(prompt)
-    each: list[list[int]] = []
-    for name in words:
-        whole = tokenizer(f"{text}{gap}{name}", verbose=False)["input_ids"]
-        follows = joined and whole[: len(begun)] == begun
-        tokens = whole[len(begun) :] if follows else tokenizer(name, add_special_tokens=False)["input_ids"]
-        if not tokens:
-            raise InputError(f"labels: expected names that the network has tokens for, got {name!r}")
-        each.append(tokens)
-    return each
+    return source_of(module, name, labels=names, batch_limits=(1, 1), reads_text=True, **reader.described)
 
 
 def _say_what_begins_another(tokens: Sequence[Sequence[int]], names: Sequence[str], name: str) -> None:
@@ -217,14 +112,87 @@ def _say_what_begins_another(tokens: Sequence[Sequence[int]], names: Sequence[st
 
 
 class _Speaker(nn.Module):
-    """A network that reads a picture and a prompt, and goes on."""
+    """A network that reads a picture and a question, and goes on; `described` is what `Preprocessing` does before. A
+    processor that is an affine map is measured and left to that; one that cuts a picture into patches or tiles is
+    called itself, which is differentiable where it works with torchvision."""
 
-    def __init__(self, network: nn.Module, inputs: Callable[..., dict[str, Tensor]], pixels: Pixels) -> None:
+    def __init__(self, loaded: Loaded, processor: Any, question: str) -> None:
         super().__init__()
-        self.network, self._inputs, self._pixels = network, inputs, pixels
-        taken = inspect.signature(network.forward).parameters
+        self.network, self.processor = loaded.network, processor
+        taken = inspect.signature(loaded.network.forward).parameters
         self.cache = "cache" if "cache" in taken else "past_key_values"  # its older name
         self._prompts: dict[tuple[int, int], dict[str, Tensor]] = {}
+        # the question with a place for the picture, as the network was trained on it
+        self.text = f"{getattr(processor, 'image_token', None) or ''}{question}"
+        if getattr(processor, "chat_template", None):
+            content = [{"type": "image"}, {"type": "text", "text": question}]
+            turns = [{"role": "user", "content": content}]
+            self.text = processor.apply_chat_template(turns, add_generation_prompt=True)
+        side = getattr(getattr(loaded.network.config, "vision_config", None), "image_size", None) or SIDE
+        self.side = (int(side[0]), int(side[1])) if isinstance(side, (list, tuple)) else (int(side), int(side))
+        self.described = Processing()
+        with suppress(ModelError):  # it is called then
+            self.described = measured(lambda **given: processor(text=[self.text], **given), loaded.spec)
+        self.affine = "mean" in self.described
+        if self.affine:
+            self.side = self.described.get("input_size", self.side)
+        elif importlib.util.find_spec("torchvision") is None:
+            raise ModelError(
+                f"model {loaded.spec}: its processor cuts pictures into patches or tiles, and lets gradients through "
+                "with torchvision only, which is not installed: pip install 'advsearch[torchvision]'"
+            )
+        self.described = Processing(**{**(self.described if self.affine else {}), "input_size": self.side})
+        self._check_pixels(loaded.spec)
+
+    def _check_pixels(self, spec: str) -> None:
+        """Raise a ModelError where a picture of slopes arrives otherwise than from 8-bit values by the processor."""
+        height, width = self.side
+        down, across = torch.linspace(0, 200, height)[:, None], torch.linspace(0, 200, width)
+        levels = torch.stack([(down + 0 * across), (across + 0 * down), (down + across) / 4 + 100]).round()
+        expected = self._inputs(np.ascontiguousarray(levels.byte().permute(1, 2, 0).numpy()))["pixel_values"]
+        image = levels / 255.0
+        if self.affine:
+            mean, std = (image.new_tensor(self.described[key]).view(3, 1, 1) for key in ("mean", "std"))
+            image = ((image if self.described["channels"] == "RGB" else image.flip(0)) - mean) / std
+        pixels = self._pixels(image)
+        off = float((pixels - expected).abs().max()) if pixels.shape == expected.shape else float("inf")
+        if not off <= LEVELS * float(expected.abs().max()):
+            raise ModelError(
+                f"model {spec}: its processor {type(self.processor).__name__} does something else to numbers than to "
+                "8-bit pictures. Wrap network and processing in an nn.Module of yours, and give that from Python"
+            )
+
+    def _inputs(self, picture: Any, text: str = "", **options: Any) -> dict[str, Tensor]:
+        """What the processor makes of a picture and a text, the question's by default, without what is for training."""
+        with warnings.catch_warnings():  # of how the library reads arrays
+            warnings.simplefilter("ignore")
+            given = self.processor(images=[picture], text=[text or self.text], return_tensors="pt", **options)
+        return {key: value for key, value in given.items() if isinstance(value, Tensor) and key != "labels"}
+
+    def _pixels(self, image: Tensor) -> Tensor:
+        return image[None] if self.affine else self._inputs(image.float(), do_rescale=False)["pixel_values"]
+
+    def tokens_of(self, names: Sequence[str]) -> list[list[int]]:
+        """Return the tokens of each name where it follows the prompt, with a blank between them unless one is there.
+        They are those that the whole text has more than the prompt; where it does not begin with the prompt's, as a
+        processor may end a text with a line's end, those of the name alone."""
+        tokenizer, prompt = self.processor.tokenizer, self.prompt(self.side)["input_ids"][0].tolist()
+        gap = "" if self.text[-1:].isspace() or prompt[-1] in tokenizer.all_special_ids else " "
+        begun = tokenizer(self.text, verbose=False)["input_ids"]
+        words = spoken(names)
+        # whether what the processor adds stands before or behind
+        grey = np.full((*self.side, 3), 128, np.uint8)
+        processed = self._inputs(grey, f"{self.text}{gap}{words[0]}")["input_ids"][0].tolist()
+        joined = processed[: len(prompt)] == prompt
+        each: list[list[int]] = []
+        for name in words:
+            whole = tokenizer(f"{self.text}{gap}{name}", verbose=False)["input_ids"]
+            follows = joined and whole[: len(begun)] == begun
+            tokens = whole[len(begun) :] if follows else tokenizer(name, add_special_tokens=False)["input_ids"]
+            if not tokens:
+                raise InputError(f"labels: expected names that the network has tokens for, got {name!r}")
+            each.append(tokens)
+        return each
 
     def prompt(self, side: tuple[int, int]) -> dict[str, Tensor]:
         """Return what the network is given beside the values of a picture of (height, width) pixels, and grey ones."""
@@ -296,9 +264,11 @@ class _Named(nn.Module):
 class _Free(nn.Module):
     """What is said of each picture, `advsearch.tasks.answers.Utterance`: the likeliest token after the other."""
 
-    def __init__(self, reader: _Speaker, tokenizer: Any, ends: frozenset[int], most: int) -> None:
+    def __init__(self, reader: _Speaker, most: int) -> None:
         super().__init__()
-        self.reader, self.tokenizer, self.ends, self.most = reader, tokenizer, ends, most
+        self.reader, self.tokenizer, self.most = reader, reader.processor.tokenizer, most
+        ends = reader.network.generation_config.eos_token_id
+        self.ends = frozenset(ends if isinstance(ends, (list, tuple)) else [ends]) - {None}
 
     def forward(self, images: Tensor) -> list[dict[str, Any]]:
         said = []
@@ -321,15 +291,10 @@ class _Free(nn.Module):
         return sorted(first - {self.tokenizer.unk_token_id})
 
 
-def _ends(network: Any) -> frozenset[int]:
-    said = network.generation_config.eos_token_id
-    return frozenset(said if isinstance(said, (list, tuple)) else [said]) - {None}
-
-
-def _check(loaded: Loaded, module: _Named, side: tuple[int, int]) -> None:
+def _check(loaded: Loaded, module: _Named) -> None:
     """Raise a ModelError where the network itself finds the longest name otherwise likely, read with the prompt."""
     number, longest = max(enumerate(module.tokens), key=lambda numbered: len(numbered[1]))
-    image = torch.rand((3, *side), generator=torch.Generator().manual_seed(0))
+    image = torch.rand((3, *module.reader.side), generator=torch.Generator().manual_seed(0))
     given, name = module.reader.given(image), torch.tensor(longest, device=loaded.network.device)
     whole = {**given, "input_ids": torch.cat([given["input_ids"], name[None]], dim=1)}
     for key, value in given.items():

@@ -194,9 +194,15 @@ def _called(processor: Any, spec: str, size: Processing, what: str) -> Processin
     if (ends[0] == ends[1]).all(axis=0).any():
         raise _other(spec, processor, "pads a square picture, or leaves some of its pixels out")
     levels = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
-    expected = _processed(partial(processor, **_as_it_is(processor)), levels, spec)
+    switches = ("do_resize", "do_center_crop")  # a picture has the right size
+    as_it_is = partial(processor, **{name: False for name in switches if getattr(processor, name, None)})
+    expected = _processed(as_it_is, levels, spec)
     picture = (torch.from_numpy(levels).float() / 255.0).movedim(2, 0)[None].requires_grad_()
-    call = partial(_process, processor)
+
+    def call(images: Tensor) -> Tensor:  # (N, 3, H, W) in [0, 1]; it is shown numbers up to 255, unrounded
+        shown = [as_it_is(images=255.0 * image, return_tensors="pt")["pixel_values"] for image in images]
+        return torch.cat(shown).to(images)
+
     try:
         with torch.enable_grad():
             seen = call(picture)
@@ -209,17 +215,6 @@ def _called(processor: Any, spec: str, size: Processing, what: str) -> Processin
     if not reaches or not off <= TOLERANCE * np.ptp(expected):
         raise _other(spec, processor, f"{what}, and rounds or does otherwise where a gradient goes through it")
     return Processing(processor=call, **size)
-
-
-def _process(processor: Any, images: Tensor) -> Tensor:
-    """Return what a processor returns for pictures (N, 3, H, W) in [0, 1]: it is shown numbers up to 255, unrounded."""
-    does = partial(processor, return_tensors="pt", **_as_it_is(processor))
-    return torch.cat([does(images=255.0 * image)["pixel_values"] for image in images]).to(images)
-
-
-def _as_it_is(processor: Any) -> dict[str, bool]:
-    """Return what keeps a processor from resizing and cropping a picture that has the right size."""
-    return {name: False for name in ("do_resize", "do_center_crop") if getattr(processor, name, None)}
 
 
 def _triple(numbers: Array) -> Triple:
@@ -251,21 +246,14 @@ class Adapted(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """A network of transformers, and what comes with it.
+    """A network of transformers, and what comes with it."""
 
-    Args:
-        network: itself, a `PreTrainedModel`.
-        name: what to call it.
-        spec: what its user wrote, for messages.
-        processor: its image processor; None where it has none.
-        part: loads another part by the class of transformers that does it, such as "AutoTokenizer".
-    """
-
-    network: Any
+    network: Any  # a `PreTrainedModel`
     name: str
-    spec: str
-    processor: Any
-    part: Callable[[str], Any]
+    spec: str  # what its user wrote, for messages
+    processor: Any  # of images; None where it has none
+    part: Callable[[str], Any]  # loads another part by the class that does it, such as "AutoTokenizer"
+    purpose: Purpose
 
     @cached_property
     def described(self) -> Processing:
@@ -296,13 +284,10 @@ class Loaded:
         `Source`."""
         return source_of(Adapted(self.network, ask, boxes=boxes), self.name, **{**self.described, **fields})
 
-    def when_named(self, named: Callable[[Any, Any, str, Processing, Purpose], Source]) -> Source:
-        """Return the source of a network that reads texts, which is built when the user's names are there: of the
-        network, its tokenizer, its name, what is done to pictures, and the purpose."""
-        tokenizer = self.part("AutoTokenizer")
+    def with_texts(self, module: nn.Module, names: tuple[str, ...], dtype: torch.dtype) -> Source:
+        """Return the source of a module made of the network and texts for names."""
         described = self.sized(getattr(self.network.config, "vision_config", None))
-        finish = partial(named, self.network, tokenizer, self.name, described)
-        return Source(self.network, self.name, finish=finish, reads_text=True)
+        return source_of(module, self.name, labels=names, dtype=dtype, reads_text=True, **described)
 
 
 def nearly(own: Tensor, ours: Tensor, size: float, dtype: torch.dtype) -> bool:

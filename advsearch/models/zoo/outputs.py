@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import inspect
 import math
-import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +19,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from advsearch.errors import InputError, ModelError, UnknownNameError
-from advsearch.models.model import PRESETS, SMALLEST_PROBABILITY, Model, warn
+from advsearch.models.model import PRESETS, SMALLEST_PROBABILITY, warn
 from advsearch.models.source import Purpose, Source, load_weights, near_names, source_of, split_weights
 from advsearch.models.zoo import zero_shot
 from advsearch.models.zoo.library import Adapted, Loaded, library, reading
 
 TASK = "similarity"  # the task that compares features
-
 ENDINGS = ("Model", "ModelWithProjection")
 PARTS = ("image_embeds", "pooler_output", "last_hidden_state")  # of outputs that hold the features, the best first
 TOKENS = ("cls_token", "class_embedding", "class_token")  # weights of a first token that stands for the whole picture
@@ -42,15 +39,6 @@ def gives_features(architecture: str, network: Any) -> bool:
     return getattr(network, "main_input_name", None) == "pixel_values" and not finds
 
 
-Make = Callable[[Loaded], Source]
-
-
-def source(loaded: Loaded, plain: Make | None = None, *, reads_text: bool = False) -> Source:
-    """Return the source of a network that has features: of these where they are compared, else `plain`'s, if it has
-    anything else."""
-    return Source(loaded.network, loaded.name, finish=partial(_finished, loaded, plain), reads_text=reads_text)
-
-
 def no_classes(name: str, what: str) -> ModelError:
     """Return the error for a model that is asked for classes and has features only; `what` it is: "is a
     Dinov2Model"."""
@@ -60,14 +48,15 @@ def no_classes(name: str, what: str) -> ModelError:
     )
 
 
-def _finished(loaded: Loaded, plain: Make | None, purpose: Purpose) -> Source | Model:
+def source(loaded: Loaded, plain: Callable[[Loaded], Source] | None = None) -> Source:
+    """Return the source of a network that has features: of these where they are compared, else `plain`'s, if it has
+    anything else."""
     network = loaded.network
-    if purpose.task != TASK:
+    if loaded.purpose.task != TASK:
         if plain is None:
             raise no_classes(loaded.name, f"is a {type(network).__name__}")
-        made = plain(loaded)
-        return made if made.finish is None else made.finish(purpose)
-    if purpose.prompts is not None:
+        return plain(loaded)
+    if loaded.purpose.prompts is not None:
         raise InputError(f"prompt: task {TASK} compares pictures and reads no text; leave `prompt` out")
     part, config = network, network.config
     if zero_shot.compares(network):
@@ -78,7 +67,13 @@ def _finished(loaded: Loaded, plain: Make | None, purpose: Purpose) -> Source | 
         if part is None:
             raise ModelError(f"model {loaded.spec}: has no part before its head; give its network without one")
     token = any(word in name for name, _ in part.named_parameters() for word in TOKENS)
-    return replace(loaded, network=part).source(partial(_features, token=token), **loaded.sized(config))
+
+    def features(network: Any, images: Tensor) -> Any:
+        returned = (network.get_image_features if zero_shot.compares(network) else network)(pixel_values=images)
+        found = pooled(returned, token=token)
+        return returned if found is None else found
+
+    return replace(loaded, network=part).source(features, **loaded.sized(config))
 
 
 def pooled(returned: Any, *, token: bool) -> Tensor | None:
@@ -92,12 +87,6 @@ def pooled(returned: Any, *, token: bool) -> Tensor | None:
                 return value[:, 0] if token else value.mean(dim=1)
             return value.flatten(2).mean(dim=2) if value.dim() == 4 else value
     return returned if isinstance(returned, Tensor) else None
-
-
-def _features(network: Any, images: Tensor, *, token: bool) -> Any:
-    returned = (network.get_image_features if zero_shot.compares(network) else network)(pixel_values=images)
-    features = pooled(returned, token=token)
-    return returned if features is None else features
 
 
 DISPARITY, METRIC = "relative disparity", "metric depth"
@@ -114,74 +103,69 @@ def depth_source(loaded: Loaded) -> Source:
     said = {"relative": DISPARITY, "metric": METRIC}.get(getattr(config, "depth_estimation_type", ""), "")
     kind = said or BY_FAMILY.get(config.model_type, "predicted_depth")
     framed = bool(getattr(loaded.processor, "do_pad", False)) and config.model_type == "zoedepth"
-    return loaded.source(partial(_depth, kind=kind, framed=framed))
+
+    def ask(network: Any, images: Tensor) -> dict[str, Tensor]:
+        if not framed:
+            return {kind: network(pixel_values=images).predicted_depth}
+        # ZoeDepth is shown pictures with a mirrored border, which its processor adds and its post-processing removes
+        height, width = images.shape[2:]
+        down, across = (int(math.sqrt(side / 2.0) * 3.0) for side in (height, width))
+        wide = functional.pad(images, (across, across, down, down), mode="reflect")
+        shown = functional.interpolate(wide, size=(height, width), mode="bilinear", align_corners=True)
+        depth = network(pixel_values=shown).predicted_depth[:, None]
+        depth = functional.interpolate(depth, size=wide.shape[2:], mode="bicubic")
+        return {kind: depth[:, 0, down : down + height, across : across + width]}
+
+    return loaded.source(ask)
 
 
-def _depth(network: Any, images: Tensor, *, kind: str, framed: bool) -> dict[str, Tensor]:
-    """ZoeDepth is shown pictures with a mirrored border, which its processor adds and its post-processing removes."""
-    if not framed:
-        return {kind: network(pixel_values=images).predicted_depth}
-    height, width = images.shape[2:]
-    down, across = (int(math.sqrt(side / 2.0) * 3.0) for side in (height, width))
-    wide = functional.pad(images, (across, across, down, down), mode="reflect")
-    shown = functional.interpolate(wide, size=(height, width), mode="bilinear", align_corners=True)
-    depth = network(pixel_values=shown).predicted_depth[:, None]
-    depth = functional.interpolate(depth, size=wide.shape[2:], mode="bicubic")
-    return {kind: depth[:, 0, down : down + height, across : across + width]}
-
-
-OURS = re.compile(r"(Mask2Former|OneFormer|Eomt\w*)ForUniversalSegmentation|MaskFormerForInstanceSegmentation")
+MASKS = r"^(Mask2Former|OneFormer|Eomt\w*)ForUniversalSegmentation$|^MaskFormerForInstanceSegmentation$"
 """The architectures that return masks and their classes, by name."""
 
 FINE = (384, 384)  # height and width to which transformers brings the masks of every Mask2Former before it adds them up
 SENTENCE = "the task is semantic"  # what OneFormer is told to do
 
 
-def is_ours(architecture: str, network: Any) -> bool:
-    """Whether an architecture returns masks and their classes."""
-    return OURS.fullmatch(architecture) is not None
-
-
 def mask_source(loaded: Loaded) -> Source:
-    """Return the source of a network that returns masks and their classes. Warns what its scores are
-    (ModelWarning)."""
-    warn(
-        f"model {loaded.name} gives a pixel a score of each class, summed over its masks, which is no logit: its "
-        "logarithm is used, so that margins are logarithms of a ratio of scores"
-    )
-    sentence, config = None, loaded.network.config
-    if config.model_type == "oneformer":  # numbers of tokens (1, L), filled up with 0
-        fill = {"padding": "max_length", "max_length": config.task_seq_len, "truncation": True}
-        tokens = loaded.part("AutoTokenizer")([SENTENCE], return_tensors="pt", **fill)
-        sentence = torch.as_tensor(tokens["input_ids"] * tokens["attention_mask"])
-    return loaded.source(partial(_by_pixel, sentence=sentence), labels=loaded.names or None)
-
-
-def _by_pixel(network: Any, images: Tensor, *, sentence: Tensor | None) -> Tensor:
-    """Return logarithms of scores (N, classes, H, W) of each pixel of the input.
+    """Return the source of a network that returns masks and their classes: of logarithms of scores (N, classes, H, W)
+    of each pixel of the input. Warns what these are (ModelWarning).
 
     The score of a class is the sum over queries of the probability that it is a query's, times the probability that the
     pixel is in that one's mask (Cheng et al. 2021, arXiv 2107.06278, section 3.4, "semantic inference"). Sizes are
     changed where `post_process_semantic_segmentation` of each family changes them.
     """
-    size, family = (images.shape[2], images.shape[3]), str(network.config.model_type)
-    tokens = {} if sentence is None else {"task_inputs": sentence.to(images.device).expand(len(images), -1)}
-    returned = network(pixel_values=images, **tokens)
-    masks, classes = returned.masks_queries_logits, returned.class_queries_logits.softmax(dim=-1)[..., :-1]
-    if family == "mask2former":
-        masks = functional.interpolate(masks, size=FINE, mode="bilinear")
-    elif family.startswith("eomt"):
-        masks = functional.interpolate(masks, size=size, mode="bilinear")
-    scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
-    scores = functional.interpolate(scores, size=size, mode="bilinear")
-    return scores.float().clamp_min(SMALLEST_PROBABILITY).log()
+    warn(
+        f"model {loaded.name} gives a pixel a score of each class, summed over its masks, which is no logit: its "
+        "logarithm is used, so that margins are logarithms of a ratio of scores"
+    )
+    sentence, config = None, loaded.network.config
+    family = str(config.model_type)
+    if family == "oneformer":  # numbers of tokens (1, L), filled up with 0
+        fill = {"padding": "max_length", "max_length": config.task_seq_len, "truncation": True}
+        tokens = loaded.part("AutoTokenizer")([SENTENCE], return_tensors="pt", **fill)
+        sentence = torch.as_tensor(tokens["input_ids"] * tokens["attention_mask"])
+
+    def ask(network: Any, images: Tensor) -> Tensor:
+        size = (images.shape[2], images.shape[3])
+        given = {} if sentence is None else {"task_inputs": sentence.to(images.device).expand(len(images), -1)}
+        returned = network(pixel_values=images, **given)
+        masks, classes = returned.masks_queries_logits, returned.class_queries_logits.softmax(dim=-1)[..., :-1]
+        if family == "mask2former":
+            masks = functional.interpolate(masks, size=FINE, mode="bilinear")
+        elif family.startswith("eomt"):
+            masks = functional.interpolate(masks, size=size, mode="bilinear")
+        scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
+        scores = functional.interpolate(scores, size=size, mode="bilinear")
+        return scores.float().clamp_min(SMALLEST_PROBABILITY).log()
+
+    return loaded.source(ask, labels=loaded.names or None)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # ``timm:NAME`` and ``torchvision:NAME``: networks that classify, segment or find objects, and features of timm's.
 
 
-def load_timm(spec: str) -> Source:
+def load_timm(spec: str, purpose: Purpose) -> Source:
     """Return ``timm:NAME[@weights.safetensors]``, with timm's pretrained weights where none are given. Size,
     normalisation and labels are those of its pretrained weights. Raises ModelError: timm is missing, its weights cannot
     be had, or those that were given do not fit; UnknownNameError: timm has no network of that name."""
@@ -193,10 +177,10 @@ def load_timm(spec: str) -> Source:
         module = timm.create_model(name, pretrained=weights is None)
     if weights is not None:
         load_weights(module, weights, name)
-    return _source(timm, module, name)
+    return _source(timm, module, name, purpose)
 
 
-def timm_repository(spec: str, name: str, revision: str) -> Source:
+def timm_repository(spec: str, name: str, revision: str, purpose: Purpose) -> Source:
     """Return the network of a repository, or of a folder, that timm has made; `spec` is for messages. Raises ModelError
     where timm is missing, or it cannot be had."""
     timm = library("timm", spec, "timm")
@@ -204,15 +188,15 @@ def timm_repository(spec: str, name: str, revision: str) -> Source:
     place = f"local-dir:{name}" if local else f"hf-hub:{name}{'@' if revision else ''}{revision}"
     with reading(spec, "Give a folder with config.json and model.safetensors, as timm saves them"):
         module = timm.create_model(place, pretrained=True)
-    return _source(timm, module, name.rstrip("/").rpartition("/")[2])
+    return _source(timm, module, name.rstrip("/").rpartition("/")[2], purpose)
 
 
-def of_timm(network: nn.Module) -> Source | None:
+def of_timm(network: nn.Module, purpose: Purpose) -> Source | None:
     """Return the source of a network of timm that is there already; None of any other."""
     timm: Any = sys.modules.get("timm")
     if timm is None or not isinstance(getattr(network, "pretrained_cfg", None), dict):
         return None
-    return _source(timm, network, type(network).__name__)
+    return _source(timm, network, type(network).__name__, purpose)
 
 
 def wrapped_timm(loaded: Loaded) -> Source:
@@ -221,44 +205,40 @@ def wrapped_timm(loaded: Loaded) -> Source:
     timm = library("timm", loaded.spec, "timm")
     network: Any = loaded.network
     described = getattr(network.config, "pretrained_cfg", None)
-    return _source(timm, network.timm_model, loaded.name, described, loaded.names)
+    return _source(timm, network.timm_model, loaded.name, loaded.purpose, described, loaded.names)
 
 
 def _source(
-    timm: Any, module: Any, name: str, described: Mapping[str, Any] | None = None, labels: tuple[str, ...] = ()
+    timm: Any,
+    module: Any,
+    name: str,
+    purpose: Purpose,
+    described: Mapping[str, Any] | None = None,
+    labels: tuple[str, ...] = (),
 ) -> Source:
     """Return the source of a network of timm, which is asked for its classes or for its features. `described` stands
     for its ``pretrained_cfg``; labels go before timm's."""
-
-    def finished(purpose: Purpose) -> Source:
-        compared = purpose.task == TASK
-        if module.num_classes == 0 and not compared:
-            raise no_classes(name, "is a network without a head (num_classes is 0)")
-        told = {"pretrained_cfg": dict(described)} if described else {}
-        config = timm.data.resolve_model_data_config(module, **told)
-        return source_of(
-            Adapted(module, _named_features) if compared and module.num_classes else module,
-            name,
-            input_size=(int(config["input_size"][1]), int(config["input_size"][2])),
-            mean=tuple(float(number) for number in config["mean"]),
-            std=tuple(float(number) for number in config["std"]),
-            labels=None if compared else labels or _labels(timm, module),
-        )
-
-    return Source(module, name, finish=finished)
-
-
-def _named_features(network: Any, images: Tensor) -> Any:
-    """What the head of a network of timm reads."""
-    return network.forward_head(network.forward_features(images), pre_logits=True)
-
-
-def _labels(timm: Any, module: Any) -> tuple[str, ...] | None:
-    names = module.pretrained_cfg.get("label_names")
-    subset = timm.data.infer_imagenet_subset(module)
-    if not names and subset:
+    compared, classes = purpose.task == TASK, module.num_classes
+    if classes == 0 and not compared:
+        raise no_classes(name, "is a network without a head (num_classes is 0)")
+    more = {"pretrained_cfg": dict(described)} if described else {}
+    config = timm.data.resolve_model_data_config(module, **more)
+    names = labels or module.pretrained_cfg.get("label_names")
+    if not names and (subset := timm.data.infer_imagenet_subset(module)):
         names = timm.data.ImageNetInfo(subset).label_descriptions()
-    return tuple(str(name) for name in names) if names and len(names) == module.num_classes else None
+    fitting = not compared and names and (labels or len(names) == classes)
+
+    def what_the_head_reads(network: Any, images: Tensor) -> Any:
+        return network.forward_head(network.forward_features(images), pre_logits=True)
+
+    return source_of(
+        Adapted(module, what_the_head_reads) if compared and classes else module,
+        name,
+        input_size=tuple(map(int, config["input_size"][1:])),
+        mean=tuple(map(float, config["mean"])),
+        std=tuple(map(float, config["std"])),
+        labels=tuple(map(str, names)) if fitting else None,
+    )
 
 
 MOST_DETECTED = 4
@@ -294,8 +274,11 @@ def load_torchvision(spec: str) -> Source:
     if name in segments:
         return source_of(Adapted(module, _scores_by_pixel), name, **fields)
     fields |= {"mean": None, "std": None, "batch_limits": (1, MOST_DETECTED)}
-    if (size := _size_inside(getattr(module, "transform", None))) is not None:
-        fields["input_size"] = size
+    inside = getattr(module, "transform", None)  # which would resize a square picture
+    if fixed := getattr(inside, "fixed_size", None):
+        fields["input_size"] = int(fixed[1]), int(fixed[0])
+    elif shortest := getattr(inside, "min_size", None):
+        fields["input_size"] = (int(shortest if isinstance(shortest, int) else shortest[-1]),) * 2
     return source_of(Adapted(module, _found, boxes=True), name, **fields)
 
 
@@ -315,17 +298,6 @@ def _found(network: Any, images: Tensor) -> Any:
 
 def _scores_by_pixel(network: Any, images: Tensor) -> Any:
     return network(images)["out"]
-
-
-def _size_inside(transform: Any) -> tuple[int, int] | None:
-    """Return (height, width) that a detector's transformation makes of a square picture; None if it does not tell."""
-    if fixed := getattr(transform, "fixed_size", None):
-        return int(fixed[1]), int(fixed[0])
-    shortest = getattr(transform, "min_size", None)
-    if not shortest:
-        return None
-    side = int(shortest if isinstance(shortest, int) else shortest[-1])
-    return side, side
 
 
 def _defaults(default: Any | None, classifier: nn.Module | None) -> dict[str, Any]:

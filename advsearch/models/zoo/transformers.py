@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
@@ -18,25 +19,20 @@ from torch.nn.functional import interpolate
 from advsearch.errors import ModelError, resembling
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.probe import first_line
-from advsearch.models.source import Source, source_of
+from advsearch.models.source import Purpose, Source, source_of
 from advsearch.models.zoo import language, outputs, zero_shot
 from advsearch.models.zoo.library import Adapted, Ask, Loaded, cached_file, in_pixels, library, processor_of, reading
 
 
-@dataclass(frozen=True)
-class Family:
-    """Networks of transformers that are loaded and asked alike: `ours` tells them by the name of an architecture
-    (``DeiTForImageClassificationWithTeacher``) and the network or its class, a class of transformers builds them (""
-    for the architecture itself), and `source` makes the model's source."""
+class Family(NamedTuple):
+    """Networks of transformers that are loaded and asked alike: `ours` tells them, a pattern in the name of an
+    architecture (``DeiTForImageClassificationWithTeacher``), or a function of that and the network or its class. The
+    class of transformers that builds them is AutoModel and `loader`, or for None the architecture itself; `source`
+    makes the model's source."""
 
-    ours: Callable[[str, Any], bool]
-    loader: str
+    ours: str | Callable[[str, Any], bool]
+    loader: str | None
     source: Callable[[Loaded], Source]
-
-
-def _called(part: str, source: Callable[[Loaded], Source], loader: str = "") -> Family:
-    """Networks whose architecture has a part in its name, which the class of that name builds."""
-    return Family(lambda architecture, network: part in architecture, loader or f"AutoModel{part}", source)
 
 
 PATIENCE = 5.0
@@ -45,17 +41,15 @@ PATIENCE = 5.0
 ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has made as 'hf:FOLDER'"
 
 
-def load(spec: str) -> Source:
+def load(spec: str, purpose: Purpose) -> Source:
     """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `NETWORKS`.
 
     One that reads texts gets its classes from its user (`zero_shot`, `language`). Labels of others are those that they
     were published with; size, order of channels and normalisation are measured on the image processor
     (`library.measured`), and where there is none a ModelWarning says so. Code in a repository is never run, and weights
-    are read from safetensors alone. A repository that timm has saved goes to timm.
-
-    Raises:
-        ModelError: transformers is missing, the repository cannot be had or lacks weights, its network is of another
-            kind or larger than the memory, or its processor does what `Preprocessing` can't.
+    are read from safetensors alone. A repository that timm has saved goes to timm. Raises ModelError: transformers is
+    missing, the repository cannot be had or lacks weights, its network is of another kind or larger than the memory, or
+    its processor does what `Preprocessing` can't.
     """
     name, _, revision = spec.partition(":")[2].strip().partition("@")
     transformers = library("transformers", spec, "hf")
@@ -73,21 +67,22 @@ def load(spec: str) -> Source:
             where["local_files_only"] = True
         saved = _config(transformers, name, spec, where)
         if saved.get("model_type") == "timm_wrapper" and "architectures" not in saved:  # which timm itself has saved
-            return outputs.timm_repository(spec, name, revision)
+            return outputs.timm_repository(spec, name, revision, purpose)
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
         architecture = str((getattr(config, "architectures", None) or ["none"])[0])
         kind = _kind(architecture, getattr(transformers, architecture, None), spec)
         check_fits(transformers, name, where, spec)
-        network, report = getattr(transformers, kind.loader or architecture).from_pretrained(
+        builder = architecture if kind.loader is None else f"AutoModel{kind.loader}"
+        network, report = getattr(transformers, builder).from_pretrained(
             name, use_safetensors=True, trust_remote_code=False, output_loading_info=True, **where
         )
         _check_whole(network, report, spec)
         processor = processor_of(transformers, name, where)
     part = partial(_part, transformers, spec, name, where)
-    return kind.source(Loaded(network, name.rstrip("/").rpartition("/")[2], spec, processor, part))
+    return kind.source(Loaded(network, name.rstrip("/").rpartition("/")[2], spec, processor, part, purpose))
 
 
-def of_network(network: nn.Module) -> Source | None:
+def of_network(network: nn.Module, purpose: Purpose) -> Source | None:
     """Return the source of a network of transformers that is there already; None of any other. Names come from its
     ``config``, and what is done to pictures from the repository or folder that it was loaded from; a ModelWarning says
     where that has no image processor, or can't be read any more."""
@@ -100,7 +95,8 @@ def of_network(network: nn.Module) -> Source | None:
     if origin:
         with suppress(ModelError), reading(spec, ""):  # it may not be there any more
             processor = processor_of(transformers, origin, where)
-    return kind.source(Loaded(network, spec, spec, processor, partial(_part, transformers, spec, origin, where)))
+    part = partial(_part, transformers, spec, origin, where)
+    return kind.source(Loaded(network, spec, spec, processor, part, purpose))
 
 
 def _part(transformers: Any, spec: str, name: str, where: Mapping[str, Any], loader: str) -> Any:
@@ -112,7 +108,8 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
     """Return which of `NETWORKS` an architecture is of, by its name and a network or its class; a ModelError says what
     it is otherwise."""
     for kind in NETWORKS:
-        if kind.ours(architecture, network):
+        ours = kind.ours
+        if re.search(ours, architecture) if isinstance(ours, str) else ours(architecture, network):
             return kind
     raise ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
@@ -136,10 +133,12 @@ def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -
     except OSError as error:
         if Path(name).is_dir():
             raise
+        cache = Path(import_module("huggingface_hub").constants.HF_HUB_CACHE)
+        cached = [folder.name.partition("--")[2].replace("--", "/") for folder in cache.glob("models--*")]
         raise ModelError(
             f"model {spec}: {name} is no folder here{_near_folders(name)}, and no repository of that name is in the "
-            f"cache{_near_cached(name)} or can be had ({first_line(error)}). Check the name and the network, or give a "
-            "folder"
+            f"cache{_meant(resembling(name, cached))} or can be had ({first_line(error)}). Check the name and the "
+            "network, or give a folder"
         ) from error
 
 
@@ -151,11 +150,6 @@ def _out_of_reach(name: str) -> bool:
     except Exception as error:  # its client's libraries have errors of their own
         return getattr(error, "response", None) is None
     return False
-
-
-def _near_cached(name: str) -> str:
-    cache = Path(import_module("huggingface_hub").constants.HF_HUB_CACHE)
-    return _meant(resembling(name, [f.name.partition("--")[2].replace("--", "/") for f in cache.glob("models--*")]))
 
 
 def _near_folders(name: str) -> str:
@@ -185,13 +179,11 @@ def _check_whole(network: Any, report: Any, spec: str) -> None:
 
 
 def _logits(network: Any, images: Tensor) -> Tensor:
-    """(N, classes)."""
     logits: Tensor = network(pixel_values=images).logits
     return logits
 
 
 def _logits_by_pixel(network: Any, images: Tensor) -> Tensor:
-    """(N, classes, H, W), of each pixel of the input."""
     return interpolate(_logits(network, images), size=images.shape[2:], mode="bilinear")
 
 
@@ -233,21 +225,17 @@ def _of_clips(loaded: Loaded) -> Source:
 
 
 NETWORKS = (
-    _called("ForVideoClassification", _of_clips),
-    _called("TimmWrapperForImageClassification", outputs.wrapped_timm, "AutoModelForImageClassification"),
-    _called("ForImageClassification", partial(outputs.source, plain=_with_names(_logits))),
-    _called("ForSemanticSegmentation", _with_names(_logits_by_pixel)),
-    Family(outputs.is_ours, "AutoModelForUniversalSegmentation", outputs.mask_source),
-    Family(zero_shot.finds, "AutoModelForZeroShotObjectDetection", zero_shot.detector_source),
-    _called("ForObjectDetection", _with_names(_boxes, boxes=True)),
-    Family(language.speaks, "AutoModelForImageTextToText", language.source),
-    _called("ForDepthEstimation", outputs.depth_source),
-    Family(
-        lambda architecture, network: zero_shot.compares(network),
-        "AutoModel",
-        partial(outputs.source, plain=zero_shot.source, reads_text=True),
-    ),
-    Family(outputs.gives_features, "", outputs.source),
+    Family("ForVideoClassification", "ForVideoClassification", _of_clips),
+    Family("TimmWrapperForImageClassification", "ForImageClassification", outputs.wrapped_timm),
+    Family("ForImageClassification", "ForImageClassification", partial(outputs.source, plain=_with_names(_logits))),
+    Family("ForSemanticSegmentation", "ForSemanticSegmentation", _with_names(_logits_by_pixel)),
+    Family(outputs.MASKS, "ForUniversalSegmentation", outputs.mask_source),
+    Family(f"^({'|'.join(zero_shot.DETECTORS)})$", "ForZeroShotObjectDetection", zero_shot.detector),
+    Family("ForObjectDetection", "ForObjectDetection", _with_names(_boxes, boxes=True)),
+    Family(language.speaks, "ForImageTextToText", language.source),
+    Family("ForDepthEstimation", "ForDepthEstimation", outputs.depth_source),
+    Family(lambda _, network: zero_shot.compares(network), "", partial(outputs.source, plain=zero_shot.source)),
+    Family(outputs.gives_features, None, outputs.source),
 )
 """Every kind that is read, the particular ones first."""
 
@@ -256,25 +244,22 @@ MEMORY = Path("/proc/meminfo")  # where Linux says what is free
 
 
 def check_fits(transformers: Any, name: str, where: Mapping[str, Any], spec: str) -> None:
-    """Raise a ModelError where the weights of a repository or a folder are larger than the memory that is free. They
-    are kept in the type in which they are stored. Nothing is checked where the system does not say what is free."""
-    size, free = 0, free_bytes()
+    """Raise a ModelError where the weights of a repository or a folder are larger than the memory that can be had
+    without anything else being ended, swap included. They are kept in the type in which they are stored. Nothing is
+    checked where the system does not say what is free."""
+    try:
+        lines = MEMORY.read_text(encoding="ascii").splitlines()
+        kilobytes = {line.partition(":")[0]: int(line.split()[1]) for line in lines if len(line.split()) > 1}
+        free = 1024 * (kilobytes["MemAvailable"] + kilobytes.get("SwapFree", 0))
+    except (OSError, ValueError, KeyError):
+        return
+    size = 0
     if index := cached_file(transformers, name, "model.safetensors.index.json", where):  # of several files
         size = int(json.loads(Path(index).read_text(encoding="utf-8")).get("metadata", {}).get("total_size", 0))
     elif weights := cached_file(transformers, name, "model.safetensors", where):
         size = Path(weights).stat().st_size
-    if free is not None and size > free:
+    if size > free:
         raise ModelError(
             f"model {spec}: its weights take {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are free. Give a "
             "smaller network, one whose weights are stored in bfloat16, or a machine with more memory"
         )
-
-
-def free_bytes() -> int | None:
-    """Return the bytes that can be had without anything else being ended, swap included; None where nobody says."""
-    try:
-        lines = MEMORY.read_text(encoding="ascii").splitlines()
-        kilobytes = {line.partition(":")[0]: int(line.split()[1]) for line in lines if len(line.split()) > 1}
-        return 1024 * (kilobytes["MemAvailable"] + kilobytes.get("SwapFree", 0))
-    except (OSError, ValueError, KeyError):
-        return None

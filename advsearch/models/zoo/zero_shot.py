@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -18,8 +17,8 @@ from advsearch.errors import InputError, ModelError
 from advsearch.models.labels import patterns
 from advsearch.models.model import warn
 from advsearch.models.probe import foreign
-from advsearch.models.source import Purpose, Source, sharing_copy, source_of
-from advsearch.models.zoo.library import Adapted, Ask, Loaded, Processing, in_pixels, nearly
+from advsearch.models.source import Source, sharing_copy
+from advsearch.models.zoo.library import Adapted, Ask, Loaded, in_pixels, nearly
 
 TEXTS = 64  # texts that are embedded at once
 
@@ -30,10 +29,32 @@ def compares(network: Any) -> bool:
 
 
 def source(loaded: Loaded) -> Source:
-    """Return the source of a network that becomes a classifier when names are there. Raises ModelError where it takes
-    patches in place of pictures."""
+    """Return the source of a classifier of the names that are given. Raises ModelError where the network takes patches
+    in place of pictures, or its scores are other than are worked out here."""
     check_takes_pictures(loaded.network, loaded.spec)
-    return loaded.when_named(_named)
+    name, names = loaded.name, loaded.purpose.named(loaded.name, "compares a picture with texts", "classification")
+    prompts = patterns(loaded.purpose.prompts)
+    if len(names) < 2:
+        raise InputError(f"labels: expected two names at least, of which model {name} chooses one, got {names[0]!r}")
+    tokenizer, words, alone = loaded.part("AutoTokenizer"), spoken(names), hasattr(loaded.network, "logit_bias")
+    texts = [prompts[0].replace("{}", word) for word in words]
+    with foreign(f"model {name}: cannot embed the names of `labels`"), torch.no_grad():
+        network: Any = sharing_copy(loaded.network).eval()
+        scale = network.temperature.reciprocal() if hasattr(network, "temperature") else network.logit_scale.exp()
+        rows = averaged(network, tokenizer, words, prompts)
+        head = nn.Linear(rows.shape[1], len(names))
+        head.weight.copy_(scale.float() * rows)
+        head.bias.copy_(network.logit_bias.float() if alone else torch.zeros(()))
+        compared = _Compared(network, head.to(network.device))
+        made = loaded.with_texts(compared, names, network.dtype)
+        _check(network, compared, tokenizer, texts[0], made)
+    say_what_is_one(tokenizer, texts, names, name)
+    if alone:
+        warn(
+            f"model {name} judges each name by itself, with a sigmoid of its logit: the scores that are shown are a "
+            f"softmax over the {len(names)} names, and margins are differences of logits"
+        )
+    return made
 
 
 def check_takes_pictures(network: Any, spec: str) -> None:
@@ -43,31 +64,6 @@ def check_takes_pictures(network: Any, spec: str) -> None:
             f"model {spec}: takes patches of pictures of any size (NaFlex), which are no picture; give a "
             "checkpoint of a fixed resolution, such as hf:google/siglip2-base-patch16-224"
         )
-
-
-def _named(network: Any, tokenizer: Any, name: str, described: Processing, purpose: Purpose) -> Source:
-    names = purpose.named(name, "compares a picture with texts", "classification")
-    prompts = patterns(purpose.prompts)
-    if len(names) < 2:
-        raise InputError(f"labels: expected two names at least, of which model {name} chooses one, got {names[0]!r}")
-    words, alone = spoken(names), hasattr(network, "logit_bias")
-    texts = [prompts[0].replace("{}", word) for word in words]
-    with foreign(f"model {name}: cannot embed the names of `labels`"), torch.no_grad():
-        network = sharing_copy(network).eval()
-        scale = network.temperature.reciprocal() if hasattr(network, "temperature") else network.logit_scale.exp()
-        rows = averaged(network, tokenizer, words, prompts)
-        head = nn.Linear(rows.shape[1], len(names))
-        head.weight.copy_(scale.float() * rows)
-        head.bias.copy_(network.logit_bias.float() if alone else torch.zeros(()))
-        compared = _Compared(network, head.to(network.device))
-        _check(network, compared, tokenizer, texts[0], described, name)
-    say_what_is_one(tokenizer, texts, names, name)
-    if alone:
-        warn(
-            f"model {name} judges each name by itself, with a sigmoid of its logit: the scores that are shown are a "
-            f"softmax over the {len(names)} names, and margins are differences of logits"
-        )
-    return source_of(compared, name, labels=names, dtype=network.dtype, **described)
 
 
 def spoken(names: Sequence[str]) -> list[str]:
@@ -91,15 +87,13 @@ def _encoded(network: Any, tokenizer: Any, texts: Sequence[str]) -> Mapping[str,
 def averaged(network: Any, tokenizer: Any, words: Sequence[str], prompts: Sequence[str]) -> Tensor:
     """Return one row (words, features) of length 1 for each word: its text in each prompt, embedded and averaged. They
     are normalised before and after (Radford et al. 2021, arXiv 2103.00020, section 3.1.4)."""
-    each = [_embedded(network, tokenizer, [prompt.replace("{}", word) for word in words]) for prompt in prompts]
+    each = []
+    for prompt in prompts:
+        texts = [prompt.replace("{}", word) for word in words]
+        parts = [_encoded(network, tokenizer, texts[begin : begin + TEXTS]) for begin in range(0, len(texts), TEXTS)]
+        rows = torch.cat([_pooled(network.get_text_features(**part)) for part in parts])
+        each.append(functional.normalize(rows, dim=-1))
     return functional.normalize(torch.stack(each).mean(dim=0), dim=-1)
-
-
-def _embedded(network: Any, tokenizer: Any, texts: Sequence[str]) -> Tensor:
-    """Return one row (len(texts), features) of length 1 for each text."""
-    parts = [texts[begin : begin + TEXTS] for begin in range(0, len(texts), TEXTS)]
-    rows = [_pooled(network.get_text_features(**_encoded(network, tokenizer, part))) for part in parts]
-    return functional.normalize(torch.cat(rows), dim=-1)
 
 
 def _pooled(returned: Any) -> Tensor:
@@ -117,8 +111,7 @@ class _Compared(nn.Module):
             setattr(self.network, part, None)
         self.head = head
 
-    def seen(self, images: Tensor) -> Tensor:
-        """Features (N, D) of length 1."""
+    def seen(self, images: Tensor) -> Tensor:  # features (N, D) of length 1
         return functional.normalize(_pooled(self.network.get_image_features(pixel_values=images)), dim=-1)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -126,18 +119,18 @@ class _Compared(nn.Module):
         return scores
 
 
-def _check(network: Any, compared: _Compared, tokenizer: Any, text: str, described: Processing, name: str) -> None:
+def _check(network: Any, compared: _Compared, tokenizer: Any, text: str, made: Source) -> None:
     """Raise a ModelError where the network itself gives a picture of noise and a text another score."""
-    shape = (1, 3, *described.get("input_size", (224, 224)))
+    shape = (1, 3, *(made.input_size or (224, 224)))
     noise = torch.rand(shape, generator=torch.Generator().manual_seed(0)).to(network.device, network.dtype)
     own = network(**_encoded(network, tokenizer, [text]), pixel_values=noise).logits_per_image.float()
     scale = compared.head.weight.norm(dim=-1).max()
-    row = scale * _embedded(network, tokenizer, [text])
+    row = scale * averaged(network, tokenizer, [text], ["{}"])
     ours = compared.seen(noise) @ row.T + compared.head.bias[0]
     if own.shape != ours.shape or not nearly(own, ours, max(float(scale), float(own.abs().max())), network.dtype):
         raise ModelError(
-            f"model {name}: is a {type(network).__name__}, whose scores are no scaled cosine of a picture and a text; "
-            "expected one such as CLIPModel or SiglipModel"
+            f"model {made.name}: is a {type(network).__name__}, whose scores are no scaled cosine of a picture and a "
+            "text; expected one such as CLIPModel or SiglipModel"
         )
 
 
@@ -154,59 +147,43 @@ def say_what_is_one(tokenizer: Any, texts: Sequence[str], names: Sequence[str], 
             return
 
 
-Build = Callable[[Any, Any, Sequence[str], tuple[str, ...] | None, str], Ask]
-"""Makes what asks a detector, of the network, its tokenizer, the words for each name, the prompts that were given, and
-its name: for boxes (N, K, 4) in pixels, x0 y0 x1 y1, and scores (N, K, names) in [0, 1] of each name by itself."""
+Build = Callable[[Loaded, Any, Any, Sequence[str]], Ask]
+"""Makes what asks a detector, of what was loaded, a copy of its network, its tokenizer and the words for each name: for
+boxes (N, K, 4) in pixels, x0 y0 x1 y1, and scores (N, K, names) in [0, 1] of each name by itself."""
 
 
-def finds(architecture: str, network: Any) -> bool:
-    """Whether networks of this architecture, by name, are read here."""
-    return architecture in DETECTORS
+def detector(loaded: Loaded) -> Source:
+    """Return the source of a detector of the names that are given, of a network of one of `DETECTORS`."""
+    names = loaded.purpose.named(loaded.name, "finds what it is told to", "detection")
+    tokenizer, words = loaded.part("AutoTokenizer"), spoken(names)
+    with foreign(f"model {loaded.name}: cannot read the names of `labels`"), torch.no_grad():
+        network: Any = sharing_copy(loaded.network).eval()
+        ask = DETECTORS[type(network).__name__](loaded, network, tokenizer, words)
+    say_what_is_one(tokenizer, words, names, loaded.name)
+    return loaded.with_texts(Adapted(network, ask, boxes=True), names, network.dtype)
 
 
-def detector_source(loaded: Loaded) -> Source:
-    """Return the source of a network that becomes a detector when names are there."""
-    return loaded.when_named(_detector)
-
-
-def _detector(network: Any, tokenizer: Any, name: str, described: Processing, purpose: Purpose) -> Source:
-    names = purpose.named(name, "finds what it is told to", "detection")
-    with foreign(f"model {name}: cannot read the names of `labels`"), torch.no_grad():
-        network = sharing_copy(network).eval()
-        ask = DETECTORS[type(network).__name__](network, tokenizer, spoken(names), purpose.prompts, name)
-    say_what_is_one(tokenizer, spoken(names), names, name)
-    detector = Adapted(network, ask, boxes=True)
-    return source_of(detector, name, labels=names, dtype=network.dtype, **described)
-
-
-def _owl(network: Any, tokenizer: Any, words: Sequence[str], prompts: tuple[str, ...] | None, name: str) -> Ask:
-    """The texts of a name are averaged as CLIP's are. The half of OWL for texts is left out then."""
+def _owl(loaded: Loaded, network: Any, tokenizer: Any, words: Sequence[str]) -> Ask:
+    """Each patch of the picture is one box, compared with the text of each name (Minderer et al. 2022, arXiv
+    2205.06230, section 3). The texts of a name are averaged as CLIP's are. The half of OWL for texts is left out
+    then."""
     half = getattr(network, network.base_model_prefix)
-    rows = averaged(half, tokenizer, words, patterns(prompts)).to(network.dtype)
+    rows = averaged(half, tokenizer, words, patterns(loaded.purpose.prompts)).to(network.dtype)
     half.text_model = half.text_projection = None
-    return partial(_ask_owl, rows=rows)
+
+    def ask(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
+        features = network.image_embedder(pixel_values=images)[0]
+        patches = features.flatten(1, 2)
+        logits, _ = network.class_predictor(patches, rows.to(patches).expand(len(images), -1, -1))
+        return in_pixels(network.box_predictor(patches, features), images), logits.sigmoid()
+
+    return ask
 
 
-def _ask_owl(network: Any, images: Tensor, *, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Each patch of the picture is one box, compared with the text of each name, whose features are the rows (Minderer
-    et al. 2022, arXiv 2205.06230, section 3)."""
-    features = network.image_embedder(pixel_values=images)[0]
-    patches = features.flatten(1, 2)
-    logits, _ = network.class_predictor(patches, rows.to(patches).expand(len(images), -1, -1))
-    return in_pixels(network.box_predictor(patches, features), images), logits.sigmoid()
-
-
-def _ask_grounded(network: Any, images: Tensor, *, text: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
-    """All names are one text (1, L) of tokens, and a box has a score of each of its tokens (Liu et al. 2023, arXiv
-    2303.05499, section 3). A name's is the largest of its own, which are at `places` (names, most); a shorter one's
-    first is there again."""
-    returned = network(pixel_values=images, input_ids=text.expand(len(images), -1))
-    return in_pixels(returned.pred_boxes, images), returned.logits[..., places].amax(dim=-1).sigmoid()
-
-
-def _grounded(network: Any, tokenizer: Any, words: Sequence[str], prompts: tuple[str, ...] | None, name: str) -> Ask:
-    """The text is ``mug. cup. bowl.``, as its processor writes it."""
-    prompt, *others = patterns(prompts or ("{}",))
+def _grounded(loaded: Loaded, network: Any, tokenizer: Any, words: Sequence[str]) -> Ask:
+    """All names are one text, ``mug. cup. bowl.`` as its processor writes it, and a box has a score of each of its
+    tokens (Liu et al. 2023, arXiv 2303.05499, section 3). A name's is the largest of its own."""
+    name, (prompt, *others) = loaded.name, patterns(loaded.purpose.prompts or ("{}",))
     if others:
         raise InputError(
             f"prompt: model {name} reads all names in one text, in which several prompts can't be averaged; give one, "
@@ -227,9 +204,14 @@ def _grounded(network: Any, tokenizer: Any, words: Sequence[str], prompts: tuple
             f"labels: model {name} reads the names as one text with full stops between them, in which these "
             f"{len(words)} are {len(own)}; leave . and ? out of names and prompt"
         )
-    longest = max(map(len, own))
+    longest = max(map(len, own))  # (names, most): a shorter one's first is there again
     places = torch.stack([torch.cat([run, run[:1].expand(longest - len(run))]) for run in own])
-    return partial(_ask_grounded, text=tokens[None], places=places)
+
+    def ask(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
+        returned = network(pixel_values=images, input_ids=tokens.expand(len(images), -1))
+        return in_pixels(returned.pred_boxes, images), returned.logits[..., places].amax(dim=-1).sigmoid()
+
+    return ask
 
 
 DETECTORS: dict[str, Build] = {

@@ -24,7 +24,8 @@ from advsearch.cluster import Call, Executor, Work
 from advsearch.cluster.dask_pool import executor_of
 from advsearch.config import SceneConfig, has_address, one_only
 from advsearch.controls import make_space
-from advsearch.controls.base import Control, by_distribution, sentences
+from advsearch.controls.base import Control, sentences
+from advsearch.controls.ranges import by_distribution
 from advsearch.engine import judging, loading, naming
 from advsearch.engine.journal import Journal, Shared, check_made_of, worker_call
 from advsearch.engine.judging import AnyObjective, Described, Looked, Metric, Metrics
@@ -107,7 +108,7 @@ def carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None =
                 )
             findings = Attack(journal, job.config, policy, stages, clean=job.clean).carry_out()
         if isinstance(problem.model.module, AskedModel):
-            warnings.append(problem.model.module.line.sentence)
+            warnings.append(problem.model.module.sentence)
         named = job.objective if isinstance(job.objective, str) else job.config.objective
         result = summarise(job.config, named, findings, journal, stages, warnings)
         parts = replace(job, clean=CleanMatrix())  # without the matrix of light transport, which may be large

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult
-from advsearch.controls.base import OneOf
 from advsearch.controls.path import WAY, PathControl
+from advsearch.controls.ranges import OneOf
 from advsearch.engine.judging import task_for
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import AnyModel, in_turn
@@ -33,11 +33,12 @@ from advsearch.report.shown import result_html, shown, side_by_side
 from advsearch.runs import files, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.runs.files import write_bytes
+from advsearch.scene.assembly import posed
 from advsearch.scene.assets import Shape, simpler
 from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.glb import posed, web_glb
+from advsearch.scene.glb import web_glb
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 from advsearch.tasks import Judgement, Mark
@@ -314,7 +315,7 @@ def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
         vertices = shapes[OBJECT].mesh.vertices
         middle, reach = vertices.mean(axis=0), NEAR * float(np.ptp(vertices, axis=0).max())
         near = [one for one in shapes.values() if np.abs(one.mesh.vertices.mean(axis=0) - middle).max() < reach]
-        return [replace(one, mesh=left.of(one.mesh)) if (left := fewer[one.name]) else one for one in near]
+        return [replace(one, mesh=left(one.mesh)) if (left := fewer[one.name]) else one for one in near]
 
     camera = after.get("camera.to_world")
     pose = camera_to_world(scene) if camera is None else camera.double().numpy()

@@ -83,7 +83,7 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
         rule_counts,
     )
     from advsearch.questions.explain.renders import AskedSweep, Renders, read_predictions
-    from advsearch.rules import FEWEST_ROWS, find_rules, halves, is_independent, is_shown, observed
+    from advsearch.rules import FEWEST_ROWS, find_rules, halves, is_shown, observed
 
     config, progress = asked.config, asked.progress
     progress.stage("reading rows")
@@ -119,7 +119,7 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
         controls=sweeps[0].summary.controls,
         parameters=list(table.attrs["units"]),
         **vars(counted),
-        units=None if is_independent(table) else table["unit"].nunique(),
+        units=None if table["unit"].is_unique else table["unit"].nunique(),
         rules=rules,
         not_told=not_told(found.next, len(table)),
         importance=importance,

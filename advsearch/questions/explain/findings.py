@@ -44,7 +44,6 @@ from advsearch.rules import (
     covered,
     import_library,
     interval_of,
-    is_independent,
 )
 
 MOST_PARTS = 20
@@ -90,7 +89,7 @@ class _Predictions:
     def __init__(self, table: pd.DataFrame) -> None:
         self.right: npt.NDArray[np.bool_] = table["correct"].to_numpy()
         units, self.units = np.unique(table["unit"], return_inverse=True)
-        self.count, self.independent = len(units), is_independent(table)
+        self.count, self.independent = len(units), table["unit"].is_unique
         self.variance = float(self.right.mean()) * (1.0 - float(self.right.mean()))
 
     def between(self, parts: Places) -> tuple[float, int]:
@@ -175,7 +174,7 @@ def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: floa
     """Return the largest box that promises an accuracy in (0, 1), the lower end of a 95 % interval; None where no box
     of enough rows does. Some rows choose the box, and others try it, once."""
     conditions: RuleConditions = ()
-    inside, independent = choosing, is_independent(choosing)
+    inside, independent = choosing, choosing["unit"].is_unique
     while interval_of(inside)[0] < min(accuracy + RESERVE, (1.0 + accuracy) / 2.0):
         best: RuleConditions | None = None
         most, kept = -1.0, inside

@@ -201,9 +201,8 @@ def claims_of(result: Result) -> list[Claim]:
     if result.goes_on:
         state = "is running" if getattr(result, "ending", "") == RUNNING else "is not finished"
         return [nothing_claimed(f"the run {state}" + (f"; so far: {result.brief}" if result.brief else ""))]
-    room = registry.room(result.command)
-    if room and room.claims:
-        return list(room.claims(result)) or [nothing_claimed("nothing in this run came to its end")]
+    if claims := registry.part_of(result.command, "claims"):
+        return list(claims(result)) or [nothing_claimed("nothing in this run came to its end")]
     return [nothing_claimed(f"the command {result.command} does not measure how often a model is right")]
 
 

@@ -22,15 +22,14 @@ from advsearch.attacks.domain import Draws, Product
 from advsearch.controls import (
     CONTROLS,
     Control,
-    NumberControl,
     Parameter,
     Space,
     check_instance,
     instance_of,
     unknown_control,
 )
-from advsearch.controls.base import Fixed, Number, OneOf, Value, read, to_value
-from advsearch.controls.ranges import Range
+from advsearch.controls.base import Value
+from advsearch.controls.ranges import Fixed, Number, OneOf, Range, read
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import BY_KEY
 from advsearch.runs.results import VariedValue
@@ -80,7 +79,7 @@ def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[
         if axis.name in axes:
             raise InputError(f"`grid` {name}: {axis.name} is given twice; leave one of the two out")
         drawn = instances.get(axis.instance)
-        if isinstance(drawn, NumberControl) and axis.parameter.name in drawn.specs:
+        if drawn is not None and axis.parameter.name in drawn.specs:
             raise InputError(
                 f"`grid` {name}: `controls` {axis.instance} sets {axis.parameter.name} too; leave it out of one "
                 "of the two"
@@ -115,7 +114,7 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
         raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, list(own), f"In `grid` {name}.")
     parameter = own[parameter_name]
     pictures = any(len(declared.shape) > 1 for declared in control.parameters)
-    if pictures or not issubclass(control, NumberControl) or parameter.shape != ():
+    if pictures or parameter.shape != ():
         raise InputError(
             f"`grid` {name}: expected a parameter that is one number or name, got one that is many numbers; draw it "
             f"by chance with `controls` {instance} `samples=100`"
@@ -215,22 +214,22 @@ def on_grid(controls: Sequence[Control], axes: Sequence[Axis], scene: SceneDescr
         own = [axis for axis in axes if axis.instance == instance]
         drawn = on.get(instance)
         kind: Any = CONTROLS[own[0].control] if drawn is None else type(drawn)
-        given = _ranges(drawn, scene) if isinstance(drawn, NumberControl) else {}
+        given = {} if drawn is None else _ranges(drawn, scene)
         given |= {axis.parameter.name: {"choices": list(axis.values)} for axis in own}
         on[instance] = kind(name=instance, **given)
     return tuple(on.values())
 
 
-def _ranges(control: NumberControl, scene: SceneDescription) -> dict[str, object]:
+def _ranges(control: Control, scene: SceneDescription) -> dict[str, object]:
     """Settings of a control with the ranges spelled out that it has by default."""
     given = {name: value for name, value in control.settings().items() if name not in ("kind", "name")}
     if control.asked:
         return given
     there = control.within(scene)
-    for parameter in control.parameters:
-        reach = there.search_range(parameter)
-        if parameter.name not in control.specs and reach is not None:
-            given[parameter.name] = {"choices": list(parameter.options)} if parameter.options else list(reach)
+    for parameter in map(there.in_scene, control.parameters):
+        if parameter.name not in control.specs and parameter.search is not None:
+            options, reach = parameter.options, parameter.search
+            given[parameter.name] = {"choices": list(options)} if options else list(reach)
     return given
 
 
@@ -333,7 +332,7 @@ class Points:
             into = self._small if block.size <= MOST_QUASI else self._large
             first = into[-1][2].stop if into else 0
             into.append((block, part, slice(first, first + block.size + (block.norm == "l2"))))
-            if block.size <= MOST_BINNED and block.norm != "l2" and isinstance(control, NumberControl):
+            if block.size <= MOST_BINNED and block.norm != "l2" and control.slots:
                 drawn += self._shown(control, group.parameter, block, part, first)
         self.drawn = tuple(drawn)
         small, large = (chosen[-1][2].stop if chosen else 0 for chosen in (self._small, self._large))
@@ -344,7 +343,7 @@ class Points:
         self.drawn_numbers = (small, tuple((one.name, one.column, len(one.parts)) for one in self.drawn))
         self._described: dict[tuple[object, ...], Mapping[str, Value]] = {}
 
-    def _shown(self, control: NumberControl, name: str, block: Block, part: slice, first: int) -> list[Drawn]:
+    def _shown(self, control: Control, name: str, block: Block, part: slice, first: int) -> list[Drawn]:
         parameter, spec = _spec(control, name)
         full = f"{control.name}.{name}"
         if isinstance(spec, OneOf):
@@ -354,9 +353,8 @@ class Points:
         found = []
         for number in range(block.size):
             low, high = (float(ends[part.start + number]) for ends in (self._lower, self._upper))
-            edges = to_value(
-                spec, parameter.log, torch.linspace(low, high, self.parts + 1, dtype=torch.float64)
-            ).tolist()
+            places = torch.linspace(low, high, self.parts + 1, dtype=torch.float64)
+            edges = spec.at(places, log=parameter.log).tolist()
             parts = tuple([edges[k], edges[k + 1]] for k in range(self.parts))
             found.append(Drawn(full + (f".{number}" if parameter.shape else ""), parameter.unit, first + number, parts))
         return found
@@ -429,8 +427,7 @@ class Points:
         grid has the value that was listed, not what single precision makes of it."""
         rows: list[dict[str, Value]] = [{} for _ in picks.digits]
         for control, own in zip(self.space.controls, u.split(self.space.sizes, dim=1), strict=True):
-            says = (type(control).describe, getattr(type(control), "measured", None))
-            if isinstance(control, NumberControl) and says == (NumberControl.describe, NumberControl.measured):
+            if (type(control).describe, type(control).measured) == (Control.describe, Control.measured):
                 for name, column in self._by_column(control, own, picks):
                     for row, value in zip(rows, column, strict=True):
                         row[name] = value
@@ -439,7 +436,7 @@ class Points:
                     row |= self._description(control, whole, part, digits)
         return rows
 
-    def _by_column(self, control: NumberControl, own: Tensor, picks: Picks) -> Iterator[tuple[str, list[Value]]]:
+    def _by_column(self, control: Control, own: Tensor, picks: Picks) -> Iterator[tuple[str, list[Value]]]:
         """Values of all configurations at once, parameter by parameter; the same numbers as `describe`."""
         axes, begin = {axis.name: (number, axis) for number, axis in enumerate(self._axes)}, 0
         for group in control.groups:
@@ -456,7 +453,7 @@ class Points:
                     count = len(spec.values)
                     values = [spec.values[min(count - 1, int(share * count))] for share in column.tolist()]
                 else:
-                    values = to_value(spec, parameter.log, column).tolist()
+                    values = spec.at(column, log=parameter.log).tolist()
                     full += f".{number}" if parameter.shape else ""
                 yield full, [{"value": value, "unit": _unit(parameter)} for value in values]
 
@@ -481,7 +478,7 @@ def _unit(parameter: Parameter) -> str:
     return "name" if parameter.options else parameter.unit
 
 
-def _spec(bound: NumberControl, name: str) -> tuple[Parameter, Range | OneOf]:
+def _spec(bound: Control, name: str) -> tuple[Parameter, Range | OneOf]:
     slot = next(slot for slot in bound.slots if slot.parameter.name == name)
     assert not isinstance(slot.spec, Fixed)
     return slot.parameter, slot.spec

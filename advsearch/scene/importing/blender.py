@@ -27,8 +27,7 @@ from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, r
 
 PACKAGE = ".usdz"
 LAYERS = (".usd", ".usda", ".usdc")
-USD = (*LAYERS, PACKAGE)
-"""Endings of OpenUSD files."""
+USD = (*LAYERS, PACKAGE)  # endings of OpenUSD files
 GENERATOR = "advsearch, of OpenUSD"  # what the glTF is made by; what it leaves out is in the extras of its asset
 USD_LONGEST = 120  # seconds that it may take, before `advsearch.files.scaled`
 MEMORY = 8 << 30  # bytes of memory that it may take, before `advsearch.files.scaled`
@@ -49,7 +48,6 @@ runpy.run_module("advsearch.scene.importing.usd_stage", run_name="__main__", alt
 
 
 def is_installed() -> bool:
-    """Whether `usd-core` is there."""
     return importlib.util.find_spec("pxr") is not None
 
 

@@ -87,7 +87,7 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
     return data
 
 
-def damaged(path: Path, expected: str, got: str) -> FileFormatError:
+def damaged(path: Path | str, expected: str, got: str) -> FileFormatError:
     """Return the error for a file whose content is not what its name says."""
     return FileFormatError(f"{path}: expected {expected}, got {got}; export or download the file again")
 
@@ -180,7 +180,7 @@ def check_faces(path: Path | str, count: int, got: str | None = None) -> None:
 
 
 class Notes:
-    """What is said about a file, each sentence once; and what the file has that was not taken.
+    """What is said about a file, each sentence once; what the file has that was not taken; and errors about it.
 
         notes = Notes("chair.ply")
         notes.say("the alpha of 'wood.png' is left out")
@@ -191,8 +191,8 @@ class Notes:
     A thing that a file has is a kind (a word of the format: ``"property"``, ``"keyword"``) and its name in the file.
     """
 
-    def __init__(self, source: str) -> None:
-        self.source = source
+    def __init__(self, path: Path | str) -> None:
+        self.path, self.source = path, path.name if isinstance(path, Path) else path
         self._said: dict[str, None] = {}  # quick, since a file may give cause for 100,000 warnings
         self._has: Counter[tuple[str, str]] = Counter()
         self._taken: set[tuple[str, str]] = set()
@@ -201,8 +201,19 @@ class Notes:
         """Warn, once; a clause that begins with a blank goes on after the file's name."""
         self._said[f"{self.source}{'' if clause.startswith(' ') else ': '}{clause}"] = None
 
+    def damaged(self, expected: str, got: str | bytes) -> FileFormatError:
+        """Return the error of `damaged`; of content, what it looks like."""
+        return damaged(self.path, expected, got if isinstance(got, str) else looks_like(got))
+
+    def check_most(self, count: int, limit: int, expected: str) -> None:
+        """See `check_most`."""
+        check_most(self.path, count, limit, expected)
+
+    def check_faces(self, count: int) -> None:
+        """See `check_faces`."""
+        check_faces(self.path, count)
+
     def has(self, kind: str, name: str) -> None:
-        """Note that the file has this, once more."""
         self._has[kind, name] += 1
 
     def take(self, kind: str, name: str) -> None:

@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_array, csgraph
-from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Bools, Doubles, Ints, Mesh, face_vectors
@@ -80,11 +78,13 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
         what = "all vertices coincide" if size == 0.0 else "its extent is too large to compute with"
         raise InputError(f"{source}: expected an object with a size, got a mesh in which {what}; export it again")
     points, index = np.unique((vertices - low) / size @ turn.T + 0.0, axis=0, return_inverse=True)
+    from scipy.spatial import cKDTree  # late, as in `parts`
+
     index, pairs = index.reshape(-1), cKDTree(points).query_pairs(WELD, output_type="ndarray")
     if len(pairs):
         cluster = connected(len(points), pairs[:, 0], pairs[:, 1])
-        _, first, merged = np.unique(cluster, return_index=True, return_inverse=True)
-        points, index = points[first], merged[index].astype(np.int64)
+        _, kept, merged = np.unique(cluster, return_index=True, return_inverse=True)
+        points, index = points[kept], merged[index].astype(np.int64)
     counts = [len(part.faces) for part in parts]
     return Soup(
         points=points,
@@ -271,6 +271,8 @@ def unit_vectors(vectors: Doubles) -> Doubles:
 
 def connected(count: int, a: Ints, b: Ints) -> Ints:
     """Return the component (count,) of each node of a graph with edges between a and b."""
+    from scipy.sparse import coo_array, csgraph  # late, as in `parts`
+
     graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
     return np.asarray(csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)
 

@@ -131,7 +131,8 @@ def check_header(path: Path, header: Header) -> None:
         most, count = max((channel.curve for channel in animation.channels), default=-1), len(animation.samplers)
         if most >= count:
             raise damaged(path, f"glTF with {most + 1} samplers of an animation, as it refers to", f"{count}")
-    size = max(sum(view.byteLength for view in header.bufferViews), sum(a.size() for a in header.accessors))
+    sizes = (entry.count * entry.width * np.dtype(_TYPES[entry.componentType]).itemsize for entry in header.accessors)
+    size = max(sum(view.byteLength for view in header.bufferViews), sum(sizes))
     check_most(path, size, LARGEST_VALUES, "geometry and pictures of at most {} bytes")
     for mesh in header.meshes:
         for primitive in mesh.primitives:

@@ -15,7 +15,6 @@ Unread = Annotated[JsonValue, Field(exclude=True)]
 """What is never read, and named in a warning of its own, or makes no difference."""
 Index = Annotated[int, Field(ge=0, lt=1 << 32)]
 Size = Annotated[int, Field(ge=0, lt=1 << 40)]
-_COMPONENTS = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _ELEMENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 
@@ -46,7 +45,6 @@ class Entry(BaseModel):
                 level.extend(inner for inner in inside if isinstance(inner, Entry))
 
     def references(self) -> Iterator[tuple[str, int]]:
-        """Yield what this entry refers to: the kind and the number of other entries."""
         for name, value in vars(self).items():
             level: list[Any] = [value] if name in REFERENCES else []
             for held in level:
@@ -109,10 +107,6 @@ class Accessor(Entry):
     def width(self) -> int:
         """Numbers of one of its values."""
         return _ELEMENTS[self.type]
-
-    def size(self) -> int:
-        """Bytes of its values, packed."""
-        return self.count * _COMPONENTS[self.componentType] * self.width
 
 
 class Primitive(Entry):
@@ -312,12 +306,6 @@ class MaterialEntry(Entry):
         """Name of the texture coordinates that are read."""
         return "TEXCOORD_0" if self.layout is None else self.layout.attribute
 
-    @property
-    def textures(self) -> list[TextureUse]:
-        """The uses of textures that are read, `layout` first."""
-        uses = (self.surface.baseColorTexture, self.normalTexture, self.emissiveTexture)
-        return [use for use in uses if use is not None and self.reads(use)]
-
     def reads(self, use: TextureUse | None) -> bool:
         """Whether a texture is looked up at the same places as the others, if there is one; else it is left out."""
         return use is None or self.layout is None or use.looked_up_as(self.layout)
@@ -382,11 +370,6 @@ class Header(Entry):
     extensionsUsed: List[str] = []
     extensionsRequired: List[str] = []
 
-    @property
-    def bones(self) -> dict[int, str]:
-        """What nodes are called as bones of a person, by their numbers."""
-        return {bone.node: bone.bone for bone in self.vrm_0} | {bone.node: name for name, bone in self.vrm.items()}
-
     def below(self, nodes: Iterable[int]) -> set[int]:
         """Return nodes, and all that hang on them."""
         reached, level = set[int](), set(nodes)
@@ -397,8 +380,7 @@ class Header(Entry):
 
     @property
     def parents(self) -> list[int]:
-        """The node on which each one hangs; -1 of a root."""
-        parents = [-1] * len(self.nodes)
+        parents = [-1] * len(self.nodes)  # of roots
         for number, node in enumerate(self.nodes):
             for child in node.children:
                 parents[child] = number

@@ -50,8 +50,7 @@ EXTENSIONS = {
 }
 """What becomes of a file with an extension; of all that are not named here, nor understood, `UNKNOWN`."""
 UNKNOWN = " uses {name}, which is not understood and left out"
-FAR = 1000.0
-"""Distance of a directional light, in object sizes."""
+FAR = 1000.0  # distance of a directional light, in object sizes
 
 
 def left_out(header: Header, notes: Notes) -> None:
@@ -247,7 +246,9 @@ class GltfSurfaces:
         self, surface: ImportedSurface, material: MaterialEntry, uvs: Sequence[Doubles]
     ) -> tuple[ImportedSurface, Doubles, Doubles]:
         places, scale, shift = np.concatenate([*uvs, np.zeros((0, 2))]), np.ones(2), np.zeros(2)
-        samplers, pictures = [self._sampler(use) for use in material.textures], list(surface.pictures)
+        uses = (material.surface.baseColorTexture, material.normalTexture, material.emissiveTexture)  # the layout first
+        samplers = [self._sampler(use) for use in uses if use is not None and material.reads(use)]
+        pictures = list(surface.pictures)
         if not pictures or not len(places) or not np.isfinite(places).all():
             return surface, scale, shift
         for axis, wraps in enumerate(([use.wrapS for use in samplers], [use.wrapT for use in samplers])):

@@ -41,7 +41,6 @@ def poses(header: Header) -> Iterator[tuple[int, Doubles]]:
 
 
 def matrix_of(node: Node) -> Doubles:
-    """The transform (4, 4) of one node."""
     if node.matrix is not None:
         return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)
     matrix = np.eye(4)
@@ -205,7 +204,8 @@ def skeleton_of(file: GltfFile, drawn: Mapping[int, int]) -> Skeleton | None:
             clips.append(Clip(names.free(animation.name or f"clip-{number}"), tuple(tracks)))
     if not (skins or clips or any(drawn.values())):
         return None
-    bones, called = header.bones, Names()
+    bones = {bone.node: bone.bone for bone in header.vrm_0} | {bone.node: name for name, bone in header.vrm.items()}
+    called = Names()
     turns = np.array([node.rotation or [0.0, 0.0, 0.0, 1.0] for node in header.nodes])
     return Skeleton(
         file.path.name,

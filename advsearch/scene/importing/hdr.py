@@ -27,8 +27,7 @@ from advsearch.scene.importing.files import check_most, damaged, looks_like, sho
 
 Plane = npt.NDArray[np.floating]
 Planes = tuple[Plane, Plane, Plane]
-LARGEST = 2 * LARGEST_PIXELS
-"""Pixels times channels of a file (8192 x 4096 with 4), before `advsearch.files.scaled`."""
+LARGEST = 2 * LARGEST_PIXELS  # pixels times channels of a file (8192 x 4096 with 4), before `advsearch.files.scaled`
 COLORS = {"r": "R", "red": "R", "g": "G", "green": "G", "b": "B", "blue": "B", "y": "Y", "ry": "RY", "by": "BY"}
 """Names of channels, in any case, and what they hold."""
 WHOLE = ("", "rgba", "rgb", "beauty", "combined", "color", "colour", "main", "image")
@@ -142,7 +141,7 @@ def _colored(planes: Mapping[str, Plane], size: tuple[int, ...]) -> dict[str, Pl
     """Return red, green and blue from luminance, and where there is one, chroma: RY = (R - Y) / Y, and so BY."""
     if "RY" not in planes:
         return dict.fromkeys("RGB", planes["Y"])
-    y, chroma = planes["Y"].astype(np.float32), []
+    y, chroma = planes["Y"].astype(np.float32), list[Plane]()
     for plane in (planes["RY"].astype(np.float32), planes["BY"].astype(np.float32)):
         for axis in (0, 1):  # it has a value at every n-th row and column only
             last = plane.shape[axis] - 1

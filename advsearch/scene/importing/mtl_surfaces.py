@@ -318,7 +318,6 @@ def number_in(name: str) -> int | None:
 
 
 def named(name: str, number: int) -> str:
-    """Return the name of the picture of another square."""
     return _PLACE.sub(str(number), name) if _PLACE.search(name) else _NUMBER.sub(str(number), name)
 
 

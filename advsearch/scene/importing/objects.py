@@ -38,7 +38,7 @@ from advsearch.scene.assets import (
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import gltf, gltf_parts
 from advsearch.scene.importing.blender import USD, read_mesh_bytes
-from advsearch.scene.importing.files import Notes, check_faces, damaged, looks_like, safe_name, shown, text_of
+from advsearch.scene.importing.files import Notes, looks_like, safe_name, shown, text_of
 from advsearch.scene.importing.geometry import UPRIGHT, Soup, assemble, extent_of, join, repaired
 from advsearch.scene.importing.gltf_parts import read_gltf
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, visible
@@ -60,35 +60,35 @@ def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     promised = 84 + 50 * struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 84
     corners, surface = None, ImportedSurface()
     if len(data) == promised:
-        check_faces(path, (promised - 84) // 50)
+        notes.check_faces((promised - 84) // 50)
         facets = np.frombuffer(data, _FACET, offset=84)
         points = facets["vertices"].astype(np.float64).reshape(-1, 3)
         colors = _colors(data[:80], facets["attribute"], notes)
         if colors is not None:
             corners, surface = np.repeat(colors[:, None], 3, axis=1), ImportedSurface(color=np.ones(3, np.float32))
     elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
-        points = _of_text(path, data, notes)
+        points = _of_text(data, notes)
     else:
         kind = looks_like(data)
         got = f"{len(data)} bytes, which is neither ASCII nor that long" if "another" in kind else kind
-        raise damaged(path, f"an STL file (in binary, {promised} bytes for its number of facets)", got)
+        raise notes.damaged(f"an STL file (in binary, {promised} bytes for its number of facets)", got)
     if not len(points):
         raise FileFormatError(f"{path}: expected a mesh with faces, got none; export triangles")
     return [ImportedPart(points, np.arange(len(points)).reshape(-1, 3), None, None, corners, surface)]
 
 
-def _of_text(path: Path, data: bytes, notes: Notes) -> Doubles:
+def _of_text(data: bytes, notes: Notes) -> Doubles:
     if not re.search(rb"\bend\s?solid", data, re.IGNORECASE):
-        raise damaged(path, "an ASCII STL file that ends in 'endsolid'", "one that is cut short")
+        raise notes.damaged("an ASCII STL file that ends in 'endsolid'", "one that is cut short")
     data = _NAMED.sub(b"", data.replace(b"\r", b"\n"))
     found = _VERTEX.findall(data)
-    check_faces(path, len(found) // 3)
+    notes.check_faces(len(found) // 3)
     if len(found) % 3 or len(found) != 3 * len(re.findall(rb"\bouter\s+loop\b", data, re.IGNORECASE)):
-        raise damaged(path, "facets with 3 vertices", f"{len(found):,} vertices in all")
+        raise notes.damaged("facets with 3 vertices", f"{len(found):,} vertices in all")
     try:
         points = np.array(found).astype(np.float64)
     except ValueError:
-        raise damaged(path, "three numbers after each 'vertex'", "something else") from None
+        raise notes.damaged("three numbers after each 'vertex'", "something else") from None
     for word in re.findall(rb"^[ \t]*([^\s\d]\S*)", data, re.MULTILINE):
         if text_of(word).lower() not in _WORDS:
             notes.has("statement", text_of(word))
@@ -132,7 +132,7 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     not a mesh, refers to missing geometry, or has no faces."""
     with warnings.catch_warnings(), np.errstate(all="ignore"), without_pillows_limit():
         warnings.simplefilter("ignore")
-        notes = Notes(path.name)
+        notes = Notes(path)
         return READERS[path.suffix.lower()](path, data, notes), list(notes)
 
 
@@ -170,7 +170,7 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     """Return the object of that name which some parts of a file, at least one, make up; `notes` are warnings about them
     so far, and `up` as in `import_object`. Raises InputError: the geometry has NaN, infinite, or coincident vertices
     only."""
-    seen, more, gltf_file = visible(parts), Notes(file.name), file.suffix.lower() in GLTF
+    seen, more, gltf_file = visible(parts), Notes(file), file.suffix.lower() in GLTF
     clear = ", ".join(dict.fromkeys(shown(part.surface.name or "a part") for part in parts if part not in seen))
     if clear:
         more.say(f"all light passes through {clear} (opacity 0): left out; give it an opacity to see it")

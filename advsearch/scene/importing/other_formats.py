@@ -10,14 +10,6 @@ BLENDER_READS = {
     "an FBX model": ("bpy.ops.import_scene.fbx", (".fbx",)),
     "an Alembic scene": ("bpy.ops.wm.alembic_import", (".abc",)),
 }
-ASSIMP_READS = {
-    "a COLLADA model": (".dae", ".zae"),
-    "a 3MF model": (".3mf",),
-    "a 3D Studio model": (".3ds",),
-    "an OFF mesh": (".off",),
-    "an X3D or VRML scene": (".x3d", ".wrl"),
-    "a LightWave model": (".lwo",),
-}
 SPLATS = (
     "has no surface; train one that yields a mesh (2D Gaussian Splatting's render.py writes fuse_post.ply), name that"
 )
@@ -26,7 +18,20 @@ POINTS = (
 )
 UNPACK = "unpack it, and name the mesh in it"
 ELSEWHERE = "open it in that program and export glTF (.glb)"
+ASSIMP = "make an .obj of it, with assimp (Open Asset Import Library): assimp export {file} {obj}"
 SAID = {
+    "a COLLADA model": (ASSIMP, (".dae", ".zae")),
+    "a 3MF model": (ASSIMP, (".3mf",)),
+    "a 3D Studio model": (ASSIMP, (".3ds",)),
+    "an OFF mesh": (ASSIMP, (".off",)),
+    "an X3D or VRML scene": (ASSIMP, (".x3d", ".wrl")),
+    "a LightWave model": (ASSIMP, (".lwo",)),
+    "a CAD model without triangles": (
+        "mesh it, with Gmsh: gmsh {file} -2 -o {stl}",
+        (".step", ".stp", ".iges", ".igs", ".brep"),
+    ),
+    "a building (IFC)": ("make glTF of it: IfcConvert {file} {glb}", (".ifc",)),
+    "a tile of 3D Tiles": ("take its glTF out: npx 3d-tiles-tools b3dmToGlb -i {file} -o {glb}", (".b3dm",)),
     "a model of Gaussian splats": (SPLATS, (".splat", ".ksplat", ".spz")),
     "a cloud of points": (POINTS, (".las", ".laz", ".pcd", ".e57", ".xyz", ".pts")),
     "an archive": (UNPACK, (".zip", ".gz", ".7z", ".rar", ".tar", ".tgz", ".gltfz")),
@@ -61,17 +66,9 @@ def advice(path: Path) -> str | None:
             steps = f"bpy.ops.wm.read_factory_settings(use_empty=True); {operator}(filepath={json.dumps(name)})"
             script = f"import bpy; {steps}; bpy.ops.export_scene.gltf(filepath={json.dumps(f'{path.stem}.glb')})"
             return f"{what}: make glTF of it, with Blender: blender -b --python-expr {shlex.quote(script)}"
-    file, obj, stl, glb = map(shlex.quote, (name, *(f"{path.stem}.{kind}" for kind in ("obj", "stl", "glb"))))
-    for what, suffixes in ASSIMP_READS.items():
-        if ending in suffixes:
-            return f"{what}: make an .obj of it, with assimp (Open Asset Import Library): assimp export {file} {obj}"
-    if ending in (".step", ".stp", ".iges", ".igs", ".brep"):
-        return f"a CAD model without triangles: mesh it, with Gmsh: gmsh {file} -2 -o {stl}"
-    if ending == ".ifc":
-        return f"a building (IFC): make glTF of it: IfcConvert {file} {glb}"
-    if ending == ".b3dm":
-        return f"a tile of 3D Tiles: take its glTF out: npx 3d-tiles-tools b3dmToGlb -i {file} -o {glb}"
     if ending == ".bin":
         beside = sorted(other.name for other in path.parent.glob("*.gltf"))[:1] if path.parent.is_dir() else []
         return f"a buffer, as a .gltf file has beside it: name that file{f', {beside[0]}' if beside else ''}"
-    return next((f"{what}: {said}" for what, (said, endings) in SAID.items() if ending in endings), None)
+    names = {kind: shlex.quote(f"{path.stem}.{kind}") for kind in ("obj", "stl", "glb")}
+    said = ((what, said) for what, (said, endings) in SAID.items() if ending in endings)
+    return next((f"{what}: {how.format(file=shlex.quote(name), **names)}" for what, how in said), None)

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import distance_transform_edt
 
 from advsearch.scene.assets import Bools, Doubles, Floats, Ints, grouped
 from advsearch.scene.color import srgb_to_linear
@@ -118,6 +117,8 @@ def with_opacity(color: Floats | None, factor: Floats, cutoff: float | None) -> 
     """Return a base colour (..., 3 or 4), None of None, with its alpha times a factor (1,) as opacity, or as (..., 3)
     where it is opaque. What is cut out of a picture gets the nearest colour that is seen. From the cutoff on it is
     opaque, and under it there is nothing; None for shares in between."""
+    from scipy.ndimage import distance_transform_edt  # late: the reader of USD, a process of its own, needs no scipy
+
     if color is None:
         return None
     opacity = (color[..., 3:] if color.shape[-1] == 4 else np.ones_like(color[..., :1])) * factor
@@ -191,7 +192,7 @@ class Looked(NamedTuple):
     """Values that the corners of triangles look up."""
 
     values: Doubles  # (N, C) float64
-    index: Ints  # (F, 3) int64 rows of `values`; -1 where a corner has none
+    at: Ints  # (F, 3) int64 rows of `values`; -1 where a corner has none
 
 
 def split_at_corners(
@@ -212,16 +213,16 @@ def split_at_corners(
         if most * count >= 2**63:  # numbered anew, so that it does not overflow
             key = np.unique(key, return_inverse=True)[1].reshape(-1)
             most = len(key)
-        key = key * count + looked_up.index[chosen].reshape(-1) + 1
+        key = key * count + looked_up.at[chosen].reshape(-1) + 1
         most *= count
     _, first, faces = np.unique(key, return_index=True, return_inverse=True)
 
     def rows(looked_up: Looked | None) -> Doubles | None:
-        index = np.full(1, -1) if looked_up is None else looked_up.index[chosen].reshape(-1)[first]
+        index = np.full(1, -1) if looked_up is None else looked_up.at[chosen].reshape(-1)[first]
         if looked_up is None or (index < 0).all():
             return None
         return np.where(index[:, None] >= 0, looked_up.values[index], np.nan)
 
-    vertices = points.values[points.index[chosen].reshape(-1)[first]]
+    vertices = points.values[points.at[chosen].reshape(-1)[first]]
     tint = None if colors is None else colors[chosen]
     return ImportedPart(vertices, faces.reshape(-1, 3), rows(normals), rows(uvs), tint, surface, flat=flat)

@@ -13,19 +13,7 @@ import numpy.typing as npt
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import (
-    MOST_CORNERS,
-    Notes,
-    References,
-    check_faces,
-    check_most,
-    damaged,
-    is_number,
-    looks_like,
-    numbers_in,
-    shown,
-    text_of,
-)
+from advsearch.scene.importing.files import MOST_CORNERS, Notes, References, is_number, numbers_in, shown, text_of
 from advsearch.scene.importing.geometry import cut_up
 from advsearch.scene.importing.other_formats import SPLATS
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, alike, split_at_corners
@@ -62,14 +50,14 @@ class Element:
     listed: dict[str, Lists] = field(default_factory=dict)
 
 
-def read_elements(path: Path, data: bytes) -> tuple[dict[str, Element], list[str]]:
+def read_elements(data: bytes, notes: Notes) -> tuple[dict[str, Element], list[str]]:
     """Return the elements of a file by their names, and its comments. Raises FileFormatError: it is no PLY file, its
     header is odd, or it is shorter than that says."""
     lone = data.startswith(b"ply\r") and not data.startswith(b"ply\r\n")  # carriage returns end its lines
     end = _END.search(data.replace(b"\r", b"\n") if lone else data)
     if not data.startswith(b"ply") or end is None:
-        got = "half of one" if data.startswith(b"ply") else looks_like(data)
-        raise damaged(path, "a PLY file with a complete header", got)
+        got = "half of one" if data.startswith(b"ply") else data
+        raise notes.damaged("a PLY file with a complete header", got)
     elements: dict[str, Element] = {}
     comments, order, current = list[str](), None, None
     for line in text_of(data[: end.start()]).splitlines()[1:]:
@@ -88,24 +76,25 @@ def read_elements(path: Path, data: bytes) -> tuple[dict[str, Element], list[str
             case []:
                 pass
             case _:
-                raise damaged(path, "a PLY header of elements and their properties", f"the line {shown(line)}")
+                raise notes.damaged("a PLY header of elements and their properties", f"the line {shown(line)}")
     if order is None:
-        raise damaged(path, f"a PLY header with a format of {', '.join(_FORMATS)}", "none of these")
-    check_faces(path, elements["face"].count if "face" in elements else 0)
+        raise notes.damaged(f"a PLY header with a format of {', '.join(_FORMATS)}", "none of these")
+    notes.check_faces(elements["face"].count if "face" in elements else 0)
     body, at = data[end.end() :], 0
     cells = np.frombuffer(body, np.uint8) if order else numbers_in(body, np.float64).view(np.uint8)
     for element in elements.values():
-        at = _fill(path, element, cells, at, b"" if order else body)
+        at = _fill(notes, element, cells, at, b"" if order else body)
     return elements, comments
 
 
-def _fill(path: Path, element: Element, cells: npt.NDArray[np.uint8], at: int, text: bytes) -> int:
+def _fill(notes: Notes, element: Element, cells: npt.NDArray[np.uint8], at: int, text: bytes) -> int:
     """Read the rows of an element that begin at a byte; return the byte after them. The bytes of a file in ASCII, whose
     `text` is given, are those of its numbers, float64 each."""
 
     def from_any_byte(kind: np.dtype[np.generic]) -> Numbers:
         kind = np.dtype(np.float64) if text else kind
-        return np.ndarray((max(0, len(cells) - kind.itemsize + 1),), kind, cells, 0, (1,))
+        numbers: Numbers = np.ndarray((max(0, len(cells) - kind.itemsize + 1),), kind, cells, 0, (1,))
+        return numbers
 
     values = {name: from_any_byte(kind) for name, kind in element.types.items()}
     counts = {name: from_any_byte(kind) for name, kind in element.lists.items()}
@@ -116,7 +105,7 @@ def _fill(path: Path, element: Element, cells: npt.NDArray[np.uint8], at: int, t
         if after > len(cells):
             odd = next((word for word in map(text_of, text.split()) if not is_number(word)), None)
             got = "fewer; the file is cut short" if odd is None else f"{shown(odd)} among their numbers"
-            raise damaged(path, f"{element.count:,} rows of {shown(element.name)}, as the PLY header says", got)
+            raise notes.damaged(f"{element.count:,} rows of {shown(element.name)}, as the PLY header says", got)
 
     def rows(count: int) -> tuple[dict[str, Ints], int]:
         """Go through rows one by one; return the bytes at which each property begins, and the byte after them."""
@@ -130,7 +119,7 @@ def _fill(path: Path, element: Element, cells: npt.NDArray[np.uint8], at: int, t
                     number = counted.item(place)
                     if not 0 <= number <= most:
                         what = f"lists in the PLY element {shown(element.name)}"
-                        raise damaged(path, what, f"one of {number:g} values")
+                        raise notes.damaged(what, f"one of {number:g} values")
                     place += size * int(number)
                 place += width
         check(place)
@@ -167,11 +156,11 @@ _TEXTURE = re.compile(r"texture_?file\s*[:=]?\s+(.*)", re.IGNORECASE)
 def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read a PLY file as one part for each texture. Raises FileFormatError: it is damaged, refers to vertices that are
     not there, or has no faces."""
-    elements, comments = read_elements(path, data)
-    reader = _Properties(path, elements, notes)
+    elements, comments = read_elements(data, notes)
+    reader = _Properties(elements, notes)
     points = reader.columns("vertex", (("x", "y", "z"),))
     if points is None:
-        raise damaged(path, "a PLY file with vertices that have x, y and z", "none")
+        raise notes.damaged("a PLY file with vertices that have x, y and z", "none")
     corner, counts = reader.polygons(len(points))
     triangles, face = cut_up(points[corner], counts, notes)
     at = corner[triangles]
@@ -181,7 +170,7 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     number = reader.texture_numbers(names, corner, counts)[face]
     tint = reader.colors(at, face)
     surfaces = [*reader.textures(names, plain=tint is None), ImportedSurface()]
-    parts, mapped = [], np.full((len(at), 3), -1) if uvs is None else uvs.index
+    parts, mapped = list[ImportedPart](), np.full((len(at), 3), -1) if uvs is None else uvs.at
     for chosen in alike(number, np.asarray((mapped >= 0).all(axis=1))):
         surface, colors = surfaces[number[chosen[0]]], tint
         if tint is not None and surface.texture is not None:
@@ -197,7 +186,6 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
 
 @dataclass
 class _Properties:
-    path: Path
     elements: dict[str, Element]
     notes: Notes
 
@@ -244,11 +232,11 @@ class _Properties:
         if (counts < 3).all():
             splats = "f_dc_0" in self.elements["vertex"].scalars  # of 3D Gaussian splatting
             what = f"Gaussian splats, a model that {SPLATS}" if splats else "points or lines only; export triangles"
-            raise FileFormatError(f"{self.path}: expected a mesh with faces, got {what}")
-        check_most(self.path, int(counts.max()), MOST_CORNERS, "faces with at most {} corners")
-        check_faces(self.path, int((counts - 2).clip(0).sum()))
+            raise FileFormatError(f"{self.notes.path}: expected a mesh with faces, got {what}")
+        self.notes.check_most(int(counts.max()), MOST_CORNERS, "faces with at most {} corners")
+        self.notes.check_faces(int((counts - 2).clip(0).sum()))
         if corners.min() < 0 or corners.max() >= points:
-            raise damaged(self.path, "faces of its own vertices", "a face that refers to a vertex that is not there")
+            raise self.notes.damaged("faces of its own vertices", "a face that refers to a vertex that is not there")
         return corners, counts
 
     def mapped(self, corner: Ints, counts: Ints, triangles: Ints) -> Looked | None:
@@ -315,7 +303,8 @@ class _Properties:
 
     def textures(self, names: Sequence[str], *, plain: bool) -> list[ImportedSurface]:
         """Return the surface of each texture; `plain` tells that there are no colours beside them."""
-        pictures, surfaces = FilePictures(len(names), References(self.path), self.notes), {}
+        pictures = FilePictures(len(names), References(Path(self.notes.path)), self.notes)
+        surfaces = {}
         instead = "neutral grey is" if plain else "the colours of its vertices or faces are"
         for name in dict.fromkeys(names):
             words = f" names the texture {{name}}, which {{why}}; {instead} used instead"

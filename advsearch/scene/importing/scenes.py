@@ -187,7 +187,6 @@ class FileFrame:
     origin: Doubles
 
     def inside(self, places: Doubles) -> Doubles:
-        """Return places (..., 3) of the file, z up, in its own coordinates."""
         return np.asarray((places - self.origin) / self.size)
 
 

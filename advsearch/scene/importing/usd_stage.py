@@ -168,7 +168,6 @@ class Conversion:
             yield prim
 
     def glb(self) -> bytes:
-        """Return the file."""
         unit = UsdGeom.GetStageMetersPerUnit(self.stage)
         if not 0.0 < unit < math.inf:
             raise FileFormatError(f"{self.source}: expected metersPerUnit greater than 0, got {unit}")
@@ -421,12 +420,10 @@ class Conversion:
             surface |= {"metallicFactor": metallic, "roughnessFactor": rough}
         else:
             surface |= {"metallicFactor": 1.0, "roughnessFactor": 1.0, "metallicRoughnessTexture": {"index": packed}}
-        normals = inputs.texture("normal", "rgb")
-        if normals is not None:
-            entry["normalTexture"] = {"index": normals}
-        glow, glowing = inputs.color("emissiveColor", (0.0, 0.0, 0.0)), inputs.texture("emissiveColor", "rgb")
-        if glowing is not None:
-            entry["emissiveTexture"] = {"index": glowing}
+        for slot, name in {"normalTexture": "normal", "emissiveTexture": "emissiveColor"}.items():
+            if (texture := inputs.texture(name, "rgb")) is not None:
+                entry[slot] = {"index": texture}
+        glow = inputs.color("emissiveColor", (0.0, 0.0, 0.0))
         if (most := max(glow)) > 0.0:
             entry["emissiveFactor"] = [channel / max(most, 1.0) for channel in glow]
             if most > 1.0:
@@ -469,7 +466,6 @@ class Conversion:
         return files.read_bytes(Path(resolved), "a picture", LARGEST_FILE)
 
     def add_texture(self, data: bytes, sampler: Mapping[str, int]) -> int:
-        """Put a picture into the file, and return the number of its texture."""
         image = self._numbered("images", {"mimeType": mime_type(data), "bufferView": self.buffer.view(data)})
         return self._numbered("textures", {"source": image, "sampler": self._numbered("samplers", sampler)})
 
@@ -498,7 +494,6 @@ class Inputs:
         return None
 
     def value(self, name: str) -> Any:
-        """An input's own value."""
         return None if self.source(name) is not None else _produced(self.shader, name)
 
     def number(self, name: str, otherwise: float) -> float:

@@ -17,19 +17,7 @@ from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Doubles, Ints, face_vectors
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import mtl_surfaces
-from advsearch.scene.importing.files import (
-    MOST_CORNERS,
-    Notes,
-    References,
-    check_faces,
-    check_most,
-    damaged,
-    is_number,
-    looks_like,
-    numbers_in,
-    shown,
-    text_of,
-)
+from advsearch.scene.importing.files import MOST_CORNERS, Notes, References, is_number, numbers_in, shown, text_of
 from advsearch.scene.importing.geometry import cut_up
 from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of, without_comment
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, alike, split_at_corners
@@ -45,10 +33,10 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     """Read an OBJ file, and the material files that it names, as one part for each material, and another for its faces
     without texture coordinates. Raises FileFormatError: it is of another kind, is cut short, refers to what is not in
     it, or has no faces."""
-    lines = Lines(path, data)
+    lines = Lines(data, notes)
     tables = {kind: lines.table(kind) for kind in TABLES}
     if not len(tables["v"]):
-        raise damaged(path, EXPECTED, looks_like(data))
+        raise notes.damaged(EXPECTED, data)
     corners, counts, rows = lines.faces({kind: len(table) for kind, table in tables.items()})
     if (counts < 3).all():
         raise FileFormatError(f"{path}: expected a mesh with faces, got points or lines only; export triangles")
@@ -61,16 +49,16 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     reader = MtlReader(references, notes, shown_on)
     named, materials, smoothing = _statements(lines, notes)
     named = list(dict.fromkeys(named))
-    check_most(path, len(named), MOST_NAMED, "at most {} lines that name material files (mtllib)")
+    notes.check_most(len(named), MOST_NAMED, "at most {} lines that name material files (mtllib)")
     libraries = libraries_of(named, references)
-    check_most(path, len(libraries), MOST_NAMED, "at most {} material files")
+    notes.check_most(len(libraries), MOST_NAMED, "at most {} material files")
     for name in libraries:
         reader.read_library(name)
     points = tables["v"][:, :3]
     triangles, face = cut_up(points[corners[:, 0]], counts, notes)
     position, mapped, normal = (corners[triangles, place] for place in range(3))
     names, material = _in_effect(materials, rows[face])
-    check_most(path, len(names), MOST_NAMED, "at most {} materials")
+    notes.check_most(len(names), MOST_NAMED, "at most {} materials")
     smoothness, smooth = _in_effect(smoothing, rows[face])
     off = np.array([*(word in ("off", "0", "") for word in smoothness), False])[smooth]
     if ((smooth >= 0) & ~off & (normal < 0).any(axis=1)).any():
@@ -97,13 +85,14 @@ def read_obj(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
             elif not named:  # else it is said already that none could be read
                 notes.say(f" uses materials and names no material file (mtllib); {instead}")
         surface, tint = painted.surface, colors
-        if tint is not None and surface.texture is not None:
-            if tint[chosen].min() < 1.0:
+        color, tinted = surface.color, tint is not None and tint[chosen].min() < 1.0
+        if surface.texture is not None:
+            if tinted:
                 notes.say("colours of vertices are left out where there is a texture")
             tint = None
-        elif tint is not None and surface.color is None:
+        elif tint is not None and color is None:
             surface = replace(surface, color=np.ones(3, np.float32))
-        elif tint is not None and surface.color[:3].min() < 0.999 and tint[chosen].min() < 1.0:
+        elif tinted and color is not None and color[:3].min() < 0.999:
             notes.say("colours of vertices are multiplied by the Kd of their material")
         uvs = (tables["vt"] - mtl_surfaces.corner_of(number)) * painted.scale + painted.offset
         used = uvs[mapped[chosen]] if inside[first] else np.zeros(0)
@@ -177,9 +166,9 @@ class Lines:
     """The lines of a file, each of its kind: ``v``, ``vt``, ``vn``, ``f``, or another. Raises FileFormatError: it is no
     text."""
 
-    def __init__(self, path: Path, data: bytes) -> None:
+    def __init__(self, data: bytes, notes: Notes) -> None:
         if b"\x00" in data:
-            raise damaged(path, EXPECTED, looks_like(data))
+            raise notes.damaged(EXPECTED, data)
         text = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n") + b"\n"
         if _CONTINUED.search(text):  # which a comment is not
             text = _CONTINUED.sub(b" ", _COMMENTED.sub(rb"\1\n", text))
@@ -187,7 +176,7 @@ class Lines:
             text = re.sub(rb"\n[ \t]+", b"\n", text.lstrip(b" \t"))
         if b"\nfo" in text:  # the old word for a face
             text = re.sub(rb"\nfo(?=[ \t])", b"\nf", text)
-        self.path, self.text = path, text
+        self.notes, self.text = notes, text
         self.unended = not data.endswith((b"\n", b"\r"))  # as files are that were cut short
         self.bytes = np.frombuffer(text, dtype=np.uint8)
         self.ends = np.flatnonzero(self.bytes == _NEWLINE)
@@ -201,7 +190,6 @@ class Lines:
             self.kind[same & _BLANK[third if longer else second]] = number
 
     def others(self) -> Iterator[tuple[int, str, str]]:
-        """Yield the row, the keyword and the rest of each line of another kind."""
         other = (self.kind == len(KINDS)) & (self.bytes[self.starts] != _NEWLINE) & (self.bytes[self.starts] != _HASH)
         for row in np.flatnonzero(other):
             line = text_of(self.text[self.starts[row] : self.ends[row]]).strip().replace("\t", " ")
@@ -226,10 +214,10 @@ class Lines:
                 where, got = f"after {kind!r} on line {number}", shown(" ".join(words))
                 if len(words) < fewest:
                     what = "3 numbers" if fewest == 3 else "numbers"
-                    raise damaged(self.path, f"{what} {where}", f"{got} (is the file cut short?)")
+                    raise self.notes.damaged(f"{what} {where}", f"{got} (is the file cut short?)")
                 if not all(map(is_number, words)):
-                    raise damaged(self.path, f"numbers {where}", got)
-            raise damaged(self.path, f"numbers after {kind!r}", "something else")
+                    raise self.notes.damaged(f"numbers {where}", got)
+            raise self.notes.damaged(f"numbers after {kind!r}", "something else")
         if (counts == counts[0]).all():
             table = values.reshape(len(rows), -1)[:, :most]
             return np.pad(table, ((0, 0), (0, most - table.shape[1])), constant_values=rest)
@@ -264,10 +252,10 @@ class Lines:
         if sizes[-1] < 3 and self.unended and rows[-1] == len(self.starts) - 1:
             ((number, words),) = self._words(rows[-1:])
             got = f"{shown(' '.join(['f', *words]))} (is the file cut short?)"
-            raise damaged(self.path, f"3 or more corners on line {number}", got)
+            raise self.notes.damaged(f"3 or more corners on line {number}", got)
         where = f"in the face on line {rows[sizes.argmax()] + 1}"
-        check_most(self.path, int(sizes.max()), MOST_CORNERS, f"at most {{}} corners {where}")
-        check_faces(self.path, int((sizes - 2).clip(0).sum()))
+        self.notes.check_most(int(sizes.max()), MOST_CORNERS, f"at most {{}} corners {where}")
+        self.notes.check_faces(int((sizes - 2).clip(0).sum()))
         corners = np.zeros((len(at), 3), dtype=np.int64)
         corners[np.cumsum(first) - 1, place] = values
         for column, kind in enumerate(TABLES):
@@ -282,7 +270,7 @@ class Lines:
             if index.max() > counts[kind]:
                 row = rows[np.searchsorted(np.cumsum(sizes), int(index.argmax()), side="right")]
                 got = f"{counts[kind]}, and a face on line {row + 1} that refers to number {index.max()}"
-                raise damaged(self.path, f"at least {index.max()} {kind!r} lines", f"{got} (is the file cut short?)")
+                raise self.notes.damaged(f"at least {index.max()} {kind!r} lines", f"{got} (is the file cut short?)")
         return corners - 1, sizes, rows
 
     def zbrush_colors(self, count: int) -> Doubles | None:
@@ -315,8 +303,8 @@ class Lines:
         for number, words in self._words(rows):
             for word in words:
                 if not _CORNER.fullmatch(word):
-                    raise damaged(self.path, f"whole numbers in the face on line {number}", shown(word))
+                    raise self.notes.damaged(f"whole numbers in the face on line {number}", shown(word))
                 indices = [int(part or "1") for part in word.split("/")]
                 if any(not index or index < -most for index, most in zip(indices, counts[number - 1], strict=False)):
-                    raise damaged(self.path, f"indices that count from 1 in the face on line {number}", shown(word))
-        raise damaged(self.path, "whole numbers in faces", "something else")
+                    raise self.notes.damaged(f"indices that count from 1 in the face on line {number}", shown(word))
+        raise self.notes.damaged("whole numbers in faces", "something else")

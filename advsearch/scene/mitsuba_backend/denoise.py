@@ -17,14 +17,9 @@ from torch import Tensor
 from advsearch.errors import EnvironmentSetupError
 from advsearch.scene.mitsuba_backend.variant import one_at_a_time
 
-KEY = 0.18
-"""Mean logarithmic luminance of a picture as the network sees it (as in Open Image Denoise's `autoexposure`)."""
-
-BIN, DARKEST = 16, 1e-8
-"""Pixels along a side of the squares whose mean luminances are averaged, and the least that counts; likewise."""
-
-LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
-"""Of red, green and blue (ITU-R BT.709); likewise."""
+KEY = 0.18  # mean logarithmic luminance of a picture as the network sees it (as in Open Image Denoise's `autoexposure`)
+BIN, DARKEST = 16, 1e-8  # pixels along a side of the squares that are averaged, and the least luminance; likewise
+LUMINANCE = np.array([0.212671, 0.715160, 0.072169])  # of red, green and blue (ITU-R BT.709); likewise
 
 
 def denoise(radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = False) -> Tensor:

@@ -29,41 +29,29 @@ from advsearch.errors import AdvsearchError, EnvironmentSetupError
 from advsearch.registry import OWN_FOLDER
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
-MINIMUM = 17
-"""The first major version that renders: see the head of this file."""
-
+MINIMUM = 17  # the first major version that renders: see the head of this file
 _PATTERNS = (
-    "usr/lib/*/libLLVM*.so*",
-    "usr/lib/libLLVM*.so*",
-    "usr/lib/llvm*/lib/libLLVM*.so*",
-    "usr/lib64/libLLVM*.so*",
-    "usr/lib64/llvm*/lib*/libLLVM*.so*",
-    "usr/local/lib/libLLVM*.so*",
-    "opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
-    "usr/local/opt/llvm*/lib/libLLVM*.dylib",
-    "home/linuxbrew/.linuxbrew/opt/llvm*/lib/libLLVM*.so*",
+    "usr/lib/*/libLLVM*.so*", "usr/lib/libLLVM*.so*", "usr/lib/llvm*/lib/libLLVM*.so*", "usr/lib64/libLLVM*.so*",
+    "usr/lib64/llvm*/lib*/libLLVM*.so*", "usr/local/lib/libLLVM*.so*", "opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
+    "usr/local/opt/llvm*/lib/libLLVM*.dylib", "home/linuxbrew/.linuxbrew/opt/llvm*/lib/libLLVM*.so*",
     "Program Files/LLVM/bin/LLVM-C.dll",
-)
+)  # fmt: skip
 """Where the packages of Debian, Ubuntu, Fedora, Arch, Homebrew and LLVM's own Windows installer put the file."""
-
 _NAME = re.compile(r"libLLVM([-.]\d+(\.\d+)*)?\.(so[^/]*|dylib)|LLVM-C\.dll")
 _NAME_VERSION = re.compile(r"libLLVM(?:\.so\.|[-.])(\d\d(?:\.\d+)*)")
 _FOLDER_VERSION = re.compile(r"llvm[-@]?/?(\d\d(?:\.\d+)*)")
-
 _PROBE = (
     "import ctypes, sys\n"
     "v = [ctypes.c_uint() for _ in range(3)]\n"
     "ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*map(ctypes.byref, v))\n"
     "print(*(n.value for n in v))\n"
 )
-
 Version = tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class LibraryFile:
-    """A libLLVM file, its version as numbers, major first (empty if it could not be told), and why Dr.Jit cannot use it
-    (empty if it can)."""
+    """A libLLVM file, its version, major first, or (), and why Dr.Jit cannot use it (empty if it can)."""
 
     path: Path
     version: Version
@@ -156,15 +144,12 @@ def ensure_llvm() -> LibraryFile:
 
 
 def install_command(release: Mapping[str, str] | None = None, system: str = sys.platform) -> str:
-    """The command that installs a good libLLVM on this machine, or one line for each known platform; by the entries of
-    ``/etc/os-release``, None reads it."""
+    """The command that installs a good libLLVM here, or a line for each platform; None reads ``/etc/os-release``."""
     sudo = "" if hasattr(os, "geteuid") and os.geteuid() == 0 else "sudo "
     commands = {
-        "Debian, Ubuntu": f"{sudo}apt-get install libllvm19",
-        "Fedora": f"{sudo}dnf install llvm-libs",
-        "Homebrew": "brew install llvm",
-        "conda": "conda install -c conda-forge libllvm19",
-    }
+        "Debian, Ubuntu": f"{sudo}apt-get install libllvm19", "Fedora": f"{sudo}dnf install llvm-libs",
+        "Homebrew": "brew install llvm", "conda": "conda install -c conda-forge libllvm19",
+    }  # fmt: skip
     if os.environ.get("CONDA_PREFIX"):
         return commands["conda"]
     if system == "darwin":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -13,29 +13,19 @@ from torch import Tensor
 from advsearch.scene.mitsuba_backend.meshes import FACES, POSITIONS
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 
-ROUGH_COTANGENT = 0.5
-"""A cotangent whose neighbours are less correlated than this counts as rough."""
-_OUTLINES, _PATHS, _SHADOWS = 1, 2, 3
-"""Streams of random numbers of one seed; the interior has number 0."""
+_OUTLINES, _PATHS, _SHADOWS = 1, 2, 3  # streams of random numbers of one seed; the interior has number 0
 
 
-# ---- the scene as we see it -----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: its Dr.Jit transforms, and what torch needs of it."""
+    """A pinhole camera, from Mitsuba's sensor: its Dr.Jit transforms, and its size in pixels."""
 
-    eye: Any
-    forward: Any
-    to_film: Any
-    to_local: Any
-    width: int
-    height: int
-
-    @property
-    def pixels(self) -> int:
-        return self.width * self.height
+    def __init__(self, sensor: Any) -> None:
+        to_world = sensor.world_transform()
+        self.width, self.height = (int(side) for side in sensor.film().crop_size())
+        self.pixels = self.width * self.height
+        self.eye = to_world @ mi.Point3f(0.0)
+        self.forward = dr.normalize(to_world @ mi.Vector3f(0.0, 0.0, 1.0))
+        self.to_film, self.to_local = sensor.projection_transform(), to_world.inverse()
 
     def project(self, point: Any) -> Any:
         """Film position in pixels of a point, differentiable."""
@@ -56,20 +46,6 @@ class Camera:
         inside = (film.x > -0.5) & (film.y > -0.5)
         return inside & (film.x < self.width + 0.5) & (film.y < self.height + 0.5)
 
-    @property
-    def focal_area(self) -> float:
-        """Pixels per unit of tangent, horizontally times vertically."""
-        matrix = self.to_film.matrix
-        return abs(float(matrix[0, 0][0]) * self.width * float(matrix[1, 1][0]) * self.height)
-
-
-def read_camera(sensor: Any) -> Camera:
-    to_world = sensor.world_transform()
-    width, height = (int(side) for side in sensor.film().crop_size())
-    forward = dr.normalize(to_world @ mi.Vector3f(0.0, 0.0, 1.0))
-    film = sensor.projection_transform()
-    return Camera(to_world @ mi.Point3f(0.0), forward, film, to_world.inverse(), width, height)
-
 
 @dataclass(frozen=True)
 class TriMesh:
@@ -77,6 +53,7 @@ class TriMesh:
     gradients enabled if it moves; whether shading normals are interpolated; corners (F, 3) int64 and places (V, 3)
     float64."""
 
+    name: str
     shape: Any
     positions: Any
     normals: Any
@@ -95,41 +72,41 @@ class TriMesh:
         a, b = (dr.gather(mi.Point3f, self.positions, side) for side in sides)
         return dr.fma(b - a, as_numbers(part), a)
 
-
-def _mesh(shape: Any, faces: Any, vertices: Tensor, normals: Tensor) -> TriMesh:
-    corners = faces.torch().reshape(-1, 3).to("cpu", torch.int64)
-    smooth = bool(shape.has_vertex_normals())
-    places = vertices.detach().to("cpu", torch.float64)
-    return TriMesh(mi.ShapePtr(shape), as_array(vertices), as_array(normals), faces, smooth, corners, places)
+    def gradients(self) -> dict[str, Tensor]:
+        """Return those by the vertices and by the normals, (V, 3) each."""
+        both = {f"{self.name}.vertices": self.positions, f"{self.name}.normals": self.normals}
+        return {name: dr.grad(values).torch().reshape(-1, 3).cpu().clone() for name, values in both.items()}
 
 
-def moving_mesh(scene: Any, parameters: Any, key: str, vertices: Tensor, normals: Tensor) -> TriMesh:
-    shape = next(shape for shape in scene.shapes() if shape.id() == key)
-    mesh = _mesh(shape, parameters[f"{key}.{FACES}"], vertices, normals)
-    dr.enable_grad(mesh.positions, mesh.normals)
-    return mesh
-
-
-def still_meshes(scene: Any, parameters: Any, moving: Sequence[str]) -> list[TriMesh]:
-    """Meshes that stand still but may hide a moving one, or shade it. A single rectangle is left out."""
-    meshes = []
-    for shape in scene.shapes():
-        if shape.is_mesh() and shape.face_count() > 2 and shape.id() not in moving:
-            places = parameters[f"{shape.id()}.{POSITIONS}"].torch().reshape(-1, 3).clone()
-            meshes.append(_mesh(shape, parameters[f"{shape.id()}.{FACES}"], places, torch.zeros_like(places)))
-    return meshes
-
-
-@dataclass(frozen=True)
 class FilmView:
-    """What the three terms share: `weights` is the cotangent with a border of zeros, flat; `meshes` are those that
-    move."""
+    """What the three terms share: the cotangent with a border of zeros, flat; the meshes that move, in the order of
+    their vertices, and those that stand still but may hide or shade them, of which a single rectangle is left out."""
 
-    scene: Any
-    camera: Camera
-    meshes: Sequence[TriMesh]
-    weights: Any
-    max_depth: int
+    def __init__(
+        self, scene: Any, sensor: Any, parameters: Any, moving: Mapping[str, Tensor], cotangent: Tensor, max_depth: int
+    ) -> None:
+        self.scene, self.camera, self.max_depth = scene, Camera(sensor), max_depth
+        self.weights = as_array(torch.nn.functional.pad(cotangent.detach(), (0, 0, 1, 1, 1, 1)))
+        moves, self.still = dict[str, TriMesh](), list[TriMesh]()
+        for shape in scene.shapes():
+            name = shape.id()
+            if f"{name}.vertices" in moving:
+                places, normals = moving[f"{name}.vertices"], moving[f"{name}.normals"]
+            elif shape.is_mesh() and shape.face_count() > 2:
+                places = parameters[f"{name}.{POSITIONS}"].torch().reshape(-1, 3).clone()
+                normals = torch.zeros_like(places)
+            else:
+                continue
+            faces, smooth = parameters[f"{name}.{FACES}"], bool(shape.has_vertex_normals())
+            corners = faces.torch().reshape(-1, 3).to("cpu", torch.int64)
+            arrays = as_array(places), as_array(normals), faces, smooth
+            mesh = TriMesh(name, mi.ShapePtr(shape), *arrays, corners, places.detach().to("cpu", torch.float64))
+            if f"{name}.vertices" in moving:
+                dr.enable_grad(mesh.positions, mesh.normals)
+                moves[f"{name}.vertices"] = mesh
+            else:
+                self.still.append(mesh)
+        self.meshes = [moves[name] for name in moving if name in moves]
 
     def weight(self, film: Any, active: Any) -> Any:
         """The cotangent at a film position, bilinear between pixel centres, zero outside; differentiable in it."""
@@ -191,17 +168,13 @@ class _Sampler:
         return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
 
 
-def shared_sampler(stream: int, count: int, index: Any) -> Any:
-    """One of `count` streams of numbers for every lane; lanes of the same index draw the same."""
+def sampler_of(stream: int, count: int, index: Any = None) -> Any:
+    """One of `count` streams of numbers for every lane, by an index (else its own); lanes of one index draw alike."""
     base = mi.PCG32(count, mi.UInt64(stream))
+    index = dr.arange(mi.UInt32, count) if index is None else index
     sampler = _Sampler()
-    sampler.rng.state = dr.gather(mi.UInt64, base.state, index)
-    sampler.rng.inc = dr.gather(mi.UInt64, base.inc, index)
+    sampler.rng.state, sampler.rng.inc = (dr.gather(mi.UInt64, values, index) for values in (base.state, base.inc))
     return sampler
-
-
-def own_sampler(stream: int, count: int) -> Any:
-    return shared_sampler(stream, count, dr.arange(mi.UInt32, count))
 
 
 def stream_of(seed: int, purpose: int, number: int = 0) -> int:
@@ -226,52 +199,24 @@ def as_vectors(kind: Any, tensor: Tensor) -> Any:
     return kind(*(as_numbers(tensor[:, axis]) for axis in range(3)))
 
 
-def from_vector(value: Any) -> Tensor:
-    """(3,) float64 of a single Dr.Jit vector."""
-    return torch.tensor([value.x[0], value.y[0], value.z[0]], dtype=torch.float64)
-
-
 def film_places(camera: Camera, places: Tensor) -> Tensor:
     """(n, 2) float64 film positions of (n, 3) points."""
     film = camera.project(as_vectors(mi.Point3f, places))
     return torch.stack([film.x.torch(), film.y.torch()], dim=1).to("cpu", torch.float64)
 
 
-def gradient_of(value: Any) -> Tensor:
-    gradient: Tensor = dr.grad(value).torch().reshape(-1, 3).cpu().clone()
-    return gradient
-
-
-def is_rough(cotangent: Tensor) -> bool:
-    """Whether neighbouring pixels ask for nearly unrelated things.
-
-    The gradient of such a cotangent has no preferred sign within a few pixels. Then the noise of the radiance cancels
-    if it is the same there; for a smooth cotangent it averages out better if it is not.
-    """
-    values = cotangent.detach().to(torch.float64)
-    right, down = (torch.diff(values, dim=dim).square().mean() for dim in (1, 0))
-    return bool(right + down > 4.0 * (1.0 - ROUGH_COTANGENT) * values.square().mean())
-
-
 # ---- Boundary terms of the material form: outlines and shadows, by sampled edges (see `adjoint`) --------------------
 
-EDGE_OFFSET = 0.01
-"""How far beside an outline we look for what is behind it, in pixels."""
-DEPTH_TOLERANCE = 1e-3
-"""Something hides an edge if it is nearer than this fraction of the distance."""
-SHADOW_OFFSET = 1e-4
-"""How far beside an edge a shadow ray passes, in extents of the mesh."""
-GRAZING = 0.02
-"""Smallest cosine at a lit point that is divided by."""
-NEAREST = 1e-3
-"""Smallest depth of an edge that is used, in world units; there is no clipping of edges."""
+EDGE_OFFSET = 0.01  # how far beside an outline we look for what is behind it, in pixels
+DEPTH_TOLERANCE = 1e-3  # something hides an edge if it is nearer than this fraction of the distance
+SHADOW_OFFSET = 1e-4  # how far beside an edge a shadow ray passes, in extents of the mesh
+GRAZING = 0.02  # smallest cosine at a lit point that is divided by
+NEAREST = 1e-3  # smallest depth of an edge that is used, in world units; there is no clipping of edges
 
 
-# ---- outlines -------------------------------------------------------------------------------------------------------
-
-
-def outline_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
-    """A number whose gradient is the outline term's, for the edges of one mesh."""
+def outline_terms(view: FilmView, mesh: TriMesh, seed: int, number: int, spp: int) -> Any:
+    """A number whose gradient is the outline term's, for the edges of one mesh, which has a number."""
+    stream = stream_of(seed, _OUTLINES, number)
     sampled = _sampled_outline(view.camera, mesh, uniform_numbers(stream, spp * view.camera.pixels, 1)[:, 0])
     if sampled is None:
         return mi.Float(0)
@@ -284,7 +229,7 @@ def outline_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
         hit = view.scene.ray_intersect_preliminary(ray, coherent=False)
         reach = dr.norm(dr.detach(edge) - view.camera.eye) * (1.0 - DEPTH_TOLERANCE)
         visible = ~hit.is_valid() | (hit.t > reach)
-        behind = view.radiance(ray, own_sampler(stream + _PATHS, len(part)), view.max_depth, visible)
+        behind = view.radiance(ray, sampler_of(stream + _PATHS, len(part)), view.max_depth, visible)
         strength = dr.sum(view.weight(film, visible) * behind)
         strength = dr.select(visible & dr.isfinite(strength), strength, 0.0)
         dr.eval(strength, hit)
@@ -300,8 +245,19 @@ def _sampled_outline(camera: Camera, mesh: TriMesh, numbers: Tensor) -> tuple[Te
         None if nothing is in the picture; else (n, 2) vertices of the edge, (n,) part of the way along it in space, (n,
         2) unit normal on the film away from the mesh, and the length in pixels for each sample.
     """
-    eye, forward = from_vector(camera.eye), from_vector(camera.forward)
-    ends, away = _silhouette(mesh.places, mesh.corners, eye)
+    eye, forward = (
+        torch.tensor([axis[0] for axis in way], dtype=torch.float64) for way in (camera.eye, camera.forward)
+    )
+
+    # Edges all of whose faces lie on one side of the plane through the edge and the eye, and that plane's normal
+    ends, owner, across = _edges(mesh.places, mesh.corners)
+    plane = torch.linalg.cross(mesh.places[ends[:, 0]] - eye, mesh.places[ends[:, 1]] - eye)
+    plane = torch.nn.functional.normalize(plane, dim=1)
+    side = (plane[owner] * (mesh.places[across] - eye)).sum(dim=1)
+    lowest = torch.full((len(ends),), torch.inf, dtype=side.dtype).scatter_reduce(0, owner, side, "amin")
+    highest = torch.full((len(ends),), -torch.inf, dtype=side.dtype).scatter_reduce(0, owner, side, "amax")
+    on = (lowest > 0.0) | (highest < 0.0)
+    ends, away = ends[on], plane[on] * torch.where(lowest[on] > 0.0, -1.0, 1.0)[:, None]
     if len(ends) == 0 or len(numbers) == 0:
         return None
     a, b = film_places(camera, mesh.places[ends[:, 0]]), film_places(camera, mesh.places[ends[:, 1]])
@@ -343,24 +299,9 @@ def _edges(places: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return sides[first], owner, across
 
 
-def _silhouette(places: Tensor, corners: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
-    """Edges all of whose faces lie on one side of the plane through the edge and the eye: (n, 2) vertices of each, and
-    (n, 3) the unit normal of that plane, away from the faces."""
-    ends, owner, across = _edges(places, corners)
-    plane = torch.linalg.cross(places[ends[:, 0]] - eye, places[ends[:, 1]] - eye)
-    plane = torch.nn.functional.normalize(plane, dim=1)
-    side = (plane[owner] * (places[across] - eye)).sum(dim=1)
-    lowest = torch.full((len(ends),), torch.inf, dtype=side.dtype).scatter_reduce(0, owner, side, "amin")
-    highest = torch.full((len(ends),), -torch.inf, dtype=side.dtype).scatter_reduce(0, owner, side, "amax")
-    on = (lowest > 0.0) | (highest < 0.0)
-    return ends[on], plane[on] * torch.where(lowest[on] > 0.0, -1.0, 1.0)[:, None]
-
-
-# ---- shadows --------------------------------------------------------------------------------------------------------
-
-
-def shadow_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
-    """A number whose gradient is the shadow term's, for the edges of one mesh."""
+def shadow_terms(view: FilmView, mesh: TriMesh, seed: int, number: int, spp: int) -> Any:
+    """A number whose gradient is the shadow term's, for the edges of one mesh, which has a number."""
+    stream = stream_of(seed, _SHADOWS, number)
     sampled = _sampled_tangents(mesh, uniform_numbers(stream, spp * view.camera.pixels, 4))
     if sampled is None:
         return mi.Float(0)
@@ -397,7 +338,9 @@ def _lit_value(view: FilmView, si: Any, d: Any) -> Any:
     value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(d), active)
     active &= dr.any(value > 0.0)
     active &= ~view.scene.ray_test(si.spawn_ray_to(camera.eye), active)
-    scale = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * camera.focal_area
+    matrix = camera.to_film.matrix
+    area = abs(float(matrix[0, 0][0]) * camera.width * float(matrix[1, 1][0]) * camera.height)  # pixels a unit tangent
+    scale = dr.abs(dr.dot(si.n, to_eye)) / depth**3 * area
     value *= scale / dr.maximum(dr.abs(dr.dot(si.n, d)), GRAZING)
     return dr.select(active, value * view.weight(film, active), 0.0)
 
@@ -414,7 +357,7 @@ def _past_minus_hit(view: FilmView, si: Any, p: Any, beside: Any, stream: int) -
     free = ~first.is_valid() | (first.t > reach)
 
     def radiance(target: Any) -> Any:
-        sampler = own_sampler(stream + _PATHS, dr.width(p))
+        sampler = sampler_of(stream + _PATHS, dr.width(p))
         return view.radiance(towards(target), sampler, view.max_depth - 1, free)
 
     return dr.select(free, radiance(p + beside) - radiance(p - beside), 0.0)
@@ -431,42 +374,38 @@ def _sampled_tangents(mesh: TriMesh, numbers: Tensor) -> tuple[Tensor, Tensor, T
         direction of the line, (n, 3) unit normal of edge and line away from the mesh, and the measure (world units
         times steradians) for each sample.
     """
-    ends, first, second, single = _folds(mesh.places, mesh.corners)
+    places = mesh.places
+    ends, owner, across = _edges(places, mesh.corners)
+    order = torch.argsort(owner, stable=True)
+    number = torch.bincount(owner, minlength=len(ends))
+    last = number.cumsum(dim=0) - 1
+    proper = (number <= 2) & ((places[ends[:, 1]] - places[ends[:, 0]]).norm(dim=1) > 0.0)
+    ends, single = ends[proper], number[proper] == 1
+    axis = _unit_edges(places, ends)
+
+    def along_face(entry: Tensor) -> Tensor:
+        """Unit vectors along one of an edge's faces, perpendicular to the edge."""
+        vector = places[across[order[entry[proper]]]] - places[ends[:, 0]]
+        return torch.nn.functional.normalize(vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1)
+
+    first, second = along_face(last - number + 1), along_face(last)
     cosine = (first * second).sum(dim=1, keepdim=True)
     rest = first - cosine * second
-    axis = _unit_edges(mesh.places, ends)
     turned = torch.where(single[:, None], torch.linalg.cross(axis, second), -torch.nn.functional.normalize(rest, dim=1))
     angle = torch.pi - torch.atan2(rest.norm(dim=1), cosine[:, 0])
-    measure = (mesh.places[ends[:, 1]] - mesh.places[ends[:, 0]]).norm(dim=1) * angle
+    measure = (places[ends[:, 1]] - places[ends[:, 0]]).norm(dim=1) * angle
     if len(numbers) == 0 or not float(measure.sum()) > 0.0:
         return None
     pick, _ = _along(measure, numbers[:, 0])
     ends, first, second, turned, axis = (tensor[pick] for tensor in (ends, first, second, turned, axis))
     turn = numbers[:, 2:3] * angle[pick][:, None]
-    across = torch.cos(turn) * second + torch.sin(turn) * turned
+    aside = torch.cos(turn) * second + torch.sin(turn) * turned
     height = 4.0 * numbers[:, 3:4] - 2.0  # the sign chooses the side, the rest is the cosine with the edge
-    across, height = torch.where(height < 0.0, -across, across), height.abs() - 1.0
-    direction = height * axis + (1.0 - height.square()).clamp_min(0.0).sqrt() * across
-    normal = torch.linalg.cross(axis, across)
+    aside, height = torch.where(height < 0.0, -aside, aside), height.abs() - 1.0
+    direction = height * axis + (1.0 - height.square()).clamp_min(0.0).sqrt() * aside
+    normal = torch.linalg.cross(axis, aside)
     normal = normal * torch.where((normal * (first + second)).sum(dim=1, keepdim=True) > 0.0, -1.0, 1.0)
     return ends, numbers[:, 1], direction, normal, 4.0 * float(measure.sum()) / len(numbers)
-
-
-def _folds(places: Tensor, corners: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Edges of one or two faces: (E, 2) vertices, (E, 3) unit vectors along one face and along the other, both
-    perpendicular to the edge, and (E,) whether there is only one face."""
-    ends, owner, across = _edges(places, corners)
-    order = torch.argsort(owner, stable=True)
-    number = torch.bincount(owner, minlength=len(ends))
-    last = number.cumsum(dim=0) - 1
-    proper = (number <= 2) & ((places[ends[:, 1]] - places[ends[:, 0]]).norm(dim=1) > 0.0)
-    ends, axis = ends[proper], _unit_edges(places, ends[proper])
-
-    def perpendicular(entry: Tensor) -> Tensor:
-        vector = places[across[order[entry[proper]]]] - places[ends[:, 0]]
-        return torch.nn.functional.normalize(vector - (vector * axis).sum(dim=1, keepdim=True) * axis, dim=1)
-
-    return ends, perpendicular(last - number + 1), perpendicular(last), number[proper] == 1
 
 
 def _unit_edges(places: Tensor, ends: Tensor) -> Tensor:

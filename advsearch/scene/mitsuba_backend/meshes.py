@@ -19,20 +19,11 @@ from advsearch.scene.parts import BASE_COLOR, MeshPart
 
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
-
-
-LEAST = 0.2
-"""See `sampling_weights`."""
-
-RENDERED: Mapping[str, tuple[float, float]] = {
-    "metallic": (0.0, 0.999),
-    "specular": (1e-3, 1.0),
-    "clearcoat": (1e-4, 1.0),
-}
+LEAST = 0.2  # see `sampling_weights`
+RENDERED = {"metallic": (0.0, 0.999), "specular": (1e-3, 1.0), "clearcoat": (1e-4, 1.0)}
 """Numbers of the principled surface that Mitsuba renders or differentiates wrongly at an end of their range: a value
 beyond is moved to the nearest of these, wherever it comes from (docs/controls/material.md)."""
-
-DARK: Mapping[str, tuple[float, float]] = {"specular": (0.0, RENDERED["specular"][0]), "eta": (1.0, 1.001)}
+DARK = {"specular": (0.0, RENDERED["specular"][0]), "eta": (1.0, 1.001)}
 """Of principled surfaces of the user's: at the first value metal would be black. Mitsuba takes the second in its place
 where the value is set later, but not where a file has it."""
 
@@ -42,13 +33,10 @@ def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
     bilinear texture of linear reflectance, and some extra entries. A clearcoat of 0 leaves the lobe out."""
     material = part.material
     surface: Plugin = {
-        "type": "principled",
-        "base_color": texture(srgb_to_linear(part.base_color)),
-        "roughness": material.roughness,
-        "metallic": rendered("metallic", material.metallic),
-        "specular": rendered("specular", material.specular),
+        "type": "principled", "base_color": texture(srgb_to_linear(part.base_color)), "roughness": material.roughness,
+        "metallic": rendered("metallic", material.metallic), "specular": rendered("specular", material.specular),
         **(extra or {}),
-    }
+    }  # fmt: skip
     if material.clearcoat > 0.0:
         surface["clearcoat"] = rendered("clearcoat", material.clearcoat)
     bsdf: Plugin = {"type": "twosided", "bsdf": surface}
@@ -122,8 +110,7 @@ def own_surface(surface: Mapping[str, object], fill: Callable[[Mapping[str, obje
 
 
 def base_texture(base_color: Floats, options: Mapping[str, object]) -> Plugin:
-    """A base colour (h, w, 3), display-referred, as a texture of linear reflectance that is looked up as `options`
-    say."""
+    """A display-referred base colour (h, w, 3) as a texture of linear reflectance, looked up as `options` say."""
     return {**texture(srgb_to_linear(base_color)), **loadable(options)}
 
 

@@ -6,7 +6,6 @@ Import this only inside Mitsuba's scenes: it registers them, which takes the var
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,38 +26,23 @@ from advsearch.scene.mitsuba_backend.variant import dr, mi
 #
 # Only directions change: the scene is taken to be far away compared to the sheet.
 
-WATER = 1.33
-"""Index of refraction."""
-DISTANCE, APERTURE = 60.0, 1.0
-"""Of the sheet from the camera, and radius of the camera's aperture, millimetres."""
-CONTACT = (25.0, 42.0)
-"""Angles between a drop's surface and the glass at its rim, degrees."""
-SPREAD = 0.45
-"""Of the logarithm of radii."""
-BEYOND = 1.1
-"""How far over the edge of the picture the drops go, in half widths."""
-GRID = 1024
-"""Along a side of the grid that says which drop is where."""
+WATER = 1.33  # index of refraction
+DISTANCE, APERTURE = 60.0, 1.0  # of the sheet from the camera, and radius of the camera's aperture, millimetres
+CONTACT = (25.0, 42.0)  # angles between a drop's surface and the glass at its rim, degrees
+SPREAD = 0.45  # of the logarithm of radii
+BEYOND = 1.1  # how far over the edge of the picture the drops go, in half widths
+GRID = 1024  # along a side of the grid that says which drop is where
 
 
-@dataclass(frozen=True, eq=False)
-class Raindrops:
-    """Drops on a square of the sheet, in millimetres from where the camera looks.
+def raindrops(count: int, size: float, seed: int, tangent: float) -> tuple[float, Floats, Ints]:
+    """Make drops on a square of the sheet for a camera with the tangent of half its field of view along the larger
+    side, with a median radius of `size`; the seed says where they are, and how large. All in millimetres.
 
-    Attributes:
-        half: half a side of the square.
-        drops: (N, 4) float32, of each the x and y of its middle, its radius on the sheet and that of its curvature.
-        grid: (GRID, GRID) number of the drop that is highest in the middle of each cell, rows along y; N for none.
+    Returns:
+        Half a side of the square, in whose middle the camera looks; (N, 4) float32, of each drop the x and y of its
+        middle, its radius on the sheet and that of its curvature; and (GRID, GRID) the number of the drop that is
+        highest in the middle of each cell, rows along y, or N for none.
     """
-
-    half: float
-    drops: Floats
-    grid: Ints
-
-
-def raindrops(count: int, size: float, seed: int, tangent: float) -> Raindrops:
-    """Return `count` drops, with a median radius of `size` millimetres, for a camera with the tangent of half its field
-    of view along the larger side; the seed says where they are, and how large."""
     random, half = np.random.default_rng(seed), BEYOND * DISTANCE * tangent
     places = random.uniform(-half, half, (count, 2))
     radii = size * np.exp(SPREAD * random.standard_normal(count).clip(-2.5, 2.5))
@@ -73,13 +57,11 @@ def raindrops(count: int, size: float, seed: int, tangent: float) -> Raindrops:
         above = (away < radius**2) & (tall > height[place])
         grid[place] = np.where(above, number, grid[place])
         height[place] = np.where(above, tall, height[place])
-    return Raindrops(half, np.column_stack([places, radii, curvature]).astype(np.float32), grid)
+    return half, np.column_stack([places, radii, curvature]).astype(np.float32), grid
 
 
 common: Any = mi.ad.integrators.common
-
-PHASE = 1.0 / (4.0 * math.pi)
-"""Isotropic phase function, per steradian."""
+PHASE = 1.0 / (4.0 * math.pi)  # isotropic phase function, per steradian
 NO_EXTINCTION = 1e-20
 MOST_SCATTERINGS = 8
 """Longest chain of scatterings in the haze along a path. They do not count as bounces off surfaces, so that haze of
@@ -119,16 +101,10 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
         begin = dr.maximum(middle - half, 0.0)
         return begin, dr.maximum(dr.minimum(middle + half, distance) - begin, 0.0)
 
-    def coefficients(self) -> tuple[Any, Any]:
-        """Return the scattering coefficient (3 channels) and the extinction (1 number), with derivatives if wanted."""
-        scattering, _, extinction = self.haze.get_scattering_coefficients(dr.zeros(mi.MediumInteraction3f))
-        return scattering, extinction[0]
-
     @dr.syntax  # type: ignore[untyped-decorator]
     def sample(
         self, mode: Any, scene: Any, sampler: Any, ray: Any, δL: Any, state_in: Any, active: Any, **rest: Any
     ) -> Any:
-        """See `RBIntegrator.sample`."""
         primal = mode == dr.ADMode.Primal
         context = mi.BSDFContext()
 
@@ -153,7 +129,8 @@ class HazePath(common.RBIntegrator):  # type: ignore[misc]
                 si[skipped] = beyond.compute_surface_interaction(ray, mi.RayFlags.All, skipped)
             begin, length = self.stretch(ray.o, ray.d, si.t)
             with dr.resume_grad(when=not primal):
-                scattering, extinction = self.coefficients()
+                scattering, _, extinction = self.haze.get_scattering_coefficients(dr.zeros(mi.MediumInteraction3f))
+                extinction = extinction[0]  # it is grey
                 flight = -dr.log(1.0 - sampler.next_1d()) / dr.maximum(dr.detach(extinction), NO_EXTINCTION)
                 scattered = active & (flight < length)
                 passed = dr.exp(-extinction * dr.minimum(flight, length))
@@ -236,7 +213,6 @@ class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
 
     @dr.syntax  # type: ignore[untyped-decorator]
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
-        """See `SamplingIntegrator.sample`; light passes through a surface with its probability."""
         going = mi.Bool(active)
         ray = mi.Ray3f(ray)
         covered, albedo, normal = mi.Bool(False), mi.Spectrum(0.0), mi.Normal3f(0.0)
@@ -255,15 +231,13 @@ class Guides(mi.SamplingIntegrator):  # type: ignore[misc]
         return albedo, covered, [*albedo, *normal]
 
     def aov_names(self) -> list[str]:
-        """See `SamplingIntegrator.aov_names`."""
         return [f"{name}.{channel}" for name in ("albedo", "normal") for channel in "XYZ"]
 
 
 mi.register_integrator("advsearch_guides", Guides)
 
 
-CELLS = (128, 512)
-"""Fewest and most cells along a side of the grid."""
+CELLS = (128, 512)  # fewest and most cells along a side of the grid
 
 
 def _transmitted(before: Any, behind: Any, first: float, second: float) -> Any:
@@ -294,39 +268,35 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         self._cells = tuple(max(CELLS[0], min(CELLS[1], int(side))) for side in self.film().crop_size())
         self.pose = mi.Transform4f(super().world_transform())
         self.lens = mi.TensorXf(list(numbers), (len(NUMBERS),))
-        self.rays = mi.Float()
         self._make_rays()
-        self._drops = None
+        self._half = 0.0  # of the square with drops, where there are some
         if "drops" in props:
             asked = (int(props["drops"]), float(props["drop_size"]), int(props["drop_seed"]))
-            self._drops = raindrops(*asked, float(props["drop_tangent"]))
-            self._which = mi.UInt32(self._drops.grid.reshape(-1).astype("uint32"))
+            self._half, drops, grid = raindrops(*asked, float(props["drop_tangent"]))
+            self._which = mi.UInt32(grid.reshape(-1).astype("uint32"))
             none = [[0.0, 0.0, -1.0, 1.0]]  # a drop without inside, where there is none
-            self._caps = mi.Float(np.concatenate([self._drops.drops, none]).astype("float32").reshape(-1))
+            self._caps = mi.Float(np.concatenate([drops, none]).astype("float32").reshape(-1))
             dr.eval(self._which, self._caps)
             self.m_needs_sample_3 = True
 
     def traverse(self, cb: Any) -> None:
-        """See `mi.Object.traverse`."""
         super().traverse(cb)
         cb.put("to_world", self.pose, mi.ParamFlags.NonDifferentiable)
         cb.put("lens", self.lens, mi.ParamFlags.NonDifferentiable)
 
     def parameters_changed(self, keys: Any) -> None:
-        """See `mi.Object.parameters_changed`."""
         if not keys or "lens" in keys:
             self._make_rays()
         super().parameters_changed(keys)
 
     def world_transform(self) -> Any:
-        """The pose."""
         return self.pose
 
     def sample_ray_differential(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
         """See `mi.Sensor.sample_ray_differential`; where the lens sees nothing, a ray of weight 0 that hits nothing."""
         ahead, inside = self._looked_up(sample2)
         passed = mi.Float(1.0)
-        if self._drops is not None:
+        if self._half > 0.0:
             ahead, passed = self._through_drops(ahead, sample3)
         weight = dr.select(inside, passed, 0.0)
         ray = dr.zeros(mi.RayDifferential3f)  # all of it, or it would be ragged for derivatives
@@ -337,22 +307,19 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         return ray, mi.Spectrum(weight)
 
     def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
-        """See `mi.Sensor.sample_ray`."""
         ray, weight = self.sample_ray_differential(time, sample1, sample2, sample3, active)
         return mi.Ray3f(ray), weight
 
     def without_drops(self, time: Any, place: Any) -> Any:
         """`sample_ray` where no drop is before the camera: what is true of a picture is so of the scene."""
-        drops, self._drops = self._drops, None
+        half, self._half = self._half, 0.0
         try:
             return self.sample_ray(time, 0.5, place, mi.Point2f(0.5))
         finally:
-            self._drops = drops
+            self._half = half
 
     def _through_drops(self, ahead: Any, sample: Any) -> tuple[Any, Any]:
-        """Directions behind the sheet, and the light that passes: see `advsearch.scene.mitsuba_backend.own_plugins`."""
-        assert self._drops is not None
-        lens, half = APERTURE * mi.warp.square_to_uniform_disk_concentric(sample), self._drops.half
+        lens, half = APERTURE * mi.warp.square_to_uniform_disk_concentric(sample), self._half
         reach = DISTANCE / dr.maximum(ahead.z, 1e-3)
         x, y = ahead.x * reach + lens.x, ahead.y * reach + lens.y
         column, row = ((at + half) * (GRID / (2.0 * half)) for at in (x, y))
@@ -376,10 +343,6 @@ class ModelledCamera(mi.Sensor):  # type: ignore[misc]
         lost = (beyond <= 0.0) | (outer.z <= 0.0)  # reflected inside
         weight = dr.select(wet, dr.select(lost, 0.0, passed), 1.0)
         return dr.select(wet & ~lost, dr.normalize(outer), ahead), weight
-
-    def to_string(self) -> str:
-        """See `mi.Object.to_string`."""
-        return f"ModelledCamera[{self._model.kind}]"
 
     def _make_rays(self) -> None:
         wide, tall = self._cells

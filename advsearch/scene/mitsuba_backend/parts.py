@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
+from advsearch.scene import parts
 from advsearch.scene.camera_model import NUMBERS
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -24,28 +25,10 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.grounds import paved
 from advsearch.scene.mitsuba_backend import meshes
 from advsearch.scene.mitsuba_backend.variant import Plugin, dr, fewer_warnings, mi, population
-from advsearch.scene.parts import (
-    BallLamp,
-    BeamLamp,
-    HazePart,
-    Lamp,
-    MeshPart,
-    PluginNumbers,
-    PluginPart,
-    PointLamp,
-    ProjectorPart,
-    ScenePart,
-    SpotLamp,
-)
 
 Write = Callable[[Any], Any]
 """From a Dr.Jit `TensorXf` (perhaps with gradients enabled) to the type that the Mitsuba parameter takes."""
-
-
-flat: Write = attrgetter("array")
-"""Vertex buffers: Mitsuba takes a flat array."""
-number: Write = attrgetter("array")
-"""A single number."""
+number: Write = attrgetter("array")  # a single number, or a vertex buffer, which Mitsuba takes flat
 
 
 def plain_number(value: Any) -> float:
@@ -54,17 +37,14 @@ def plain_number(value: Any) -> float:
 
 
 def color(value: Any) -> Any:
-    """Three numbers: an RGB colour."""
     return mi.Color3f(*_entries(value, 3))
 
 
 def point(value: Any) -> Any:
-    """Three numbers: a place."""
     return mi.Point3f(*_entries(value, 3))
 
 
 def transform(value: Any) -> Any:
-    """A 4 x 4 matrix, row by row."""
     entries = _entries(value, 16)
     return mi.Transform4f(mi.Matrix4f([entries[4 * row : 4 * row + 4] for row in range(4)]))
 
@@ -84,24 +64,15 @@ def _entries(value: Any, count: int) -> list[Any]:
 
 @dataclass(frozen=True)
 class SceneInput:
-    """One named input of a scene.
+    """One named input of a scene."""
 
-    Attributes:
-        name: the input's name, e.g. "key.position".
-        key: Mitsuba's parameter path, or its beginning and end with one "*" between for an unknown middle.
-        write: converts the tensor; None where Mitsuba takes it itself, as for textures and grids.
-        interior: the interior adjoint (`prb`) differentiates it correctly.
-        shape: of the tensor; None takes it from Mitsuba's own value.
-        owner: Mitsuba's object that has the parameter, where `key` alone may mean several.
-        within: the range that is rendered; a value beyond is moved to its nearer end, and keeps its derivative.
-    """
-
-    name: str
-    key: str
-    write: Write | None = None
-    interior: bool = False
-    shape: tuple[int, ...] | None = None
-    owner: Any = None
+    name: str  # the input's name, e.g. "key.position"
+    key: str  # Mitsuba's parameter path, or its beginning and end with one "*" between for an unknown middle
+    write: Write | None = None  # converts the tensor; None where Mitsuba takes it itself, as for textures and grids
+    interior: bool = False  # the interior adjoint (`prb`) differentiates it correctly
+    shape: tuple[int, ...] | None = None  # of the tensor; None takes it from Mitsuba's own value
+    owner: Any = None  # Mitsuba's object that has the parameter, where `key` alone may mean several
+    # the range that is rendered; a value beyond is moved to its nearer end, and keeps its derivative
     within: tuple[float, float] | None = None
 
     def rendered(self, value: Tensor) -> Tensor:
@@ -111,11 +82,7 @@ class SceneInput:
 
 
 def key_of(parameters: Any, scene_input: SceneInput) -> str | None:
-    """Return the parameter that an input means, or None if the scene has none such.
-
-    Raises:
-        RuntimeError: there are several.
-    """
+    """Return the one parameter that an input means, or None if the scene has none such."""
     before, star, after = scene_input.key.partition("*")
     keys = [
         str(key)
@@ -146,18 +113,18 @@ class Translation:
 
 
 @singledispatch
-def translation(part: ScenePart) -> Translation:
+def translation(part: parts.ScenePart) -> Translation:
     """Return what a part is inside Mitsuba. Further kinds of parts are registered: `@translation.register`."""
     raise TypeError(f"part {part.name}: {type(part).__name__} has no translation for Mitsuba; register one")
 
 
 @translation.register
-def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation:
+def mesh_translation(part: parts.MeshPart, lobes: Plugin | None = None) -> Translation:
     """A mesh; `lobes` are further entries of the principled plugin, such as `IDLE_LOBES`."""
     name, count = part.name, len(part.mesh.vertices)
     inputs = [
-        SceneInput(f"{name}.vertices", f"{name}.{meshes.POSITIONS}", flat, shape=(count, 3)),
-        SceneInput(f"{name}.normals", f"{name}.{meshes.NORMALS}", flat, shape=(count, 3)),
+        SceneInput(f"{name}.vertices", f"{name}.{meshes.POSITIONS}", number, shape=(count, 3)),
+        SceneInput(f"{name}.normals", f"{name}.{meshes.NORMALS}", number, shape=(count, 3)),
     ]
     if part.surface is None:
         surface = meshes.principled(part, lobes)
@@ -184,7 +151,6 @@ def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation
 
 
 def _light(name: str, what: str, key: str) -> SceneInput:
-    """The colour of a light."""
     return SceneInput(f"{name}.{what}", f"{name}.{key}.value", color, True, (3,))
 
 
@@ -193,12 +159,12 @@ def _pose(name: str, what: str) -> SceneInput:
 
 
 @translation.register
-def _plugin(part: PluginPart) -> Translation:
+def _plugin(part: parts.PluginPart) -> Translation:
     return Translation({part.name: meshes.loadable(part.plugin)}, (), {"type": "prbvolpath"} if part.volumetric else {})
 
 
 @translation.register
-def _numbers(part: PluginNumbers) -> Translation:
+def _numbers(part: parts.PluginNumbers) -> Translation:
     inputs = []
     for own in part.numbers:
         if own.input.startswith(f"{part.name}."):
@@ -210,7 +176,7 @@ def _numbers(part: PluginNumbers) -> Translation:
 
 
 @translation.register
-def _point(part: PointLamp) -> Translation:
+def _point(part: parts.PointLamp) -> Translation:
     name = part.name
     lamp = {"type": "point", "position": list(part.position), "intensity": _rgb(part.intensity)}
     position = SceneInput(f"{name}.position", f"{name}.position", point, shape=(3,))
@@ -218,32 +184,27 @@ def _point(part: PointLamp) -> Translation:
 
 
 @translation.register
-def _spot(part: SpotLamp) -> Translation:
+def _spot(part: parts.SpotLamp) -> Translation:
     cutoff, beam = part.cone
     lamp = {
-        "type": "spot",
-        "to_world": mi.ScalarTransform4f(part.to_world),
-        "intensity": _rgb(part.intensity),
-        "cutoff_angle": cutoff,
-        "beam_width": beam,
-    }
+        "type": "spot", "to_world": mi.ScalarTransform4f(part.to_world), "intensity": _rgb(part.intensity),
+        "cutoff_angle": cutoff, "beam_width": beam,
+    }  # fmt: skip
     return Translation({part.name: lamp}, (_light(part.name, "intensity", "intensity"),))
 
 
 @translation.register
-def _ball(part: BallLamp) -> Translation:
+def _ball(part: parts.BallLamp) -> Translation:
     ball = {
-        "type": "sphere",
-        "to_world": mi.ScalarTransform4f().translate(list(part.place)).scale(part.radius),
-        "bsdf": {"type": "null"},
-        "emitter": {"type": "area", "radiance": _rgb(part.radiance)},
-    }
+        "type": "sphere", "to_world": mi.ScalarTransform4f().translate(list(part.place)).scale(part.radius),
+        "bsdf": {"type": "null"}, "emitter": {"type": "area", "radiance": _rgb(part.radiance)},
+    }  # fmt: skip
     inputs = _pose(part.name, "ball"), _light(part.name, "radiance", "emitter.radiance")
     return Translation({part.name: ball}, inputs)
 
 
 @translation.register
-def _projector(part: ProjectorPart) -> Translation:
+def _projector(part: parts.ProjectorPart) -> Translation:
     """Mitsuba's texture times pi is the irradiance at distance 1, so that it is a white screen's radiance."""
     name = part.name
     picture = {"type": "bitmap", "bitmap": mi.Bitmap(np.zeros((*part.sides, 3), np.float32)), "raw": True}
@@ -253,29 +214,25 @@ def _projector(part: ProjectorPart) -> Translation:
 
 
 @translation.register
-def _beam(part: BeamLamp) -> Translation:
+def _beam(part: parts.BeamLamp) -> Translation:
     """Mitsuba's projector puts pi times its texture on a plane before it, where an intensity I puts I cos^3."""
     height, width = part.table.shape
     aside, up = np.linspace(-1.0, 1.0, 2 * width + 1)[1::2], np.linspace(-1.0, 1.0, 2 * height + 1)[1::2]
     cosine = (1.0 + aside[None] ** 2 + (up[:, None] * height / width) ** 2) ** -0.5
     picture = (part.table * cosine**3 / np.pi)[..., None] * np.array(part.tint)
     lamp = {
-        "type": "projector",
-        "to_world": mi.ScalarTransform4f(part.to_world),
-        "fov": 90.0,
-        "fov_axis": "x",
-        "irradiance": {**meshes.texture(picture), "wrap_mode": "clamp"},
-        "sampling_weight": part.weight,
-    }
+        "type": "projector", "to_world": mi.ScalarTransform4f(part.to_world), "fov": 90.0, "fov_axis": "x",
+        "irradiance": {**meshes.texture(picture), "wrap_mode": "clamp"}, "sampling_weight": part.weight,
+    }  # fmt: skip
     return Translation({part.name: lamp}, (_pose(part.name, "to_world"),))
 
 
 @translation.register
-def _haze(part: HazePart) -> Translation:
+def _haze(part: parts.HazePart) -> Translation:
     """Mitsuba's medium only holds density and albedo for the integrator: no shape refers to it."""
     name, albedo = part.name, _rgb(part.albedo)
     medium = mi.load_dict({"type": "homogeneous", "albedo": albedo, "sigma_t": part.density}, optimize=False)
-    population.keep(medium)
+    population.add(population, media=(medium,))  # Mitsuba does not let go of it
     inputs = (
         SceneInput(f"{name}.density", f"{name}.sigma_t.value.value", number, True, (1,)),
         SceneInput(f"{name}.albedo", f"{name}.albedo.value.value", color, True, (3,)),
@@ -287,22 +244,7 @@ def _rgb(value: Sequence[float]) -> Plugin:
     return {"type": "rgb", "value": list(value)}
 
 
-def leave_dark_lamps_out(plugins: Plugin, parts: Sequence[ScenePart]) -> None:
-    """Change Mitsuba's dictionary of a scene with some parts so that no samples are taken towards lamps that emit
-    nothing.
-
-    A path that arrives at one by chance still counts, with all of the weight, so that nothing is biased should it be
-    lit after all.
-    """
-    for part in parts:
-        if isinstance(part, Lamp) and part.dark:
-            plugin = plugins[part.name]
-            plugin.get("emitter", plugin)["sampling_weight"] = 0.0
-
-
 GROUND = "ground"
-GROUND_INPUT = SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", interior=True)
-"""(h, w, 3): the texture of a ground that shows the environment's photograph (`advsearch.scene.grounds`)."""
 
 
 def scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:
@@ -311,21 +253,13 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
     place = mi.ScalarTransform4f
     number = description.number
     film = {
-        "type": "hdrfilm",
-        "width": width,
-        "height": height,
-        "pixel_format": "rgba" if description.backdrop else "rgb",
-        "component_format": "float32",
-        "rfilter": {"type": filter},
-    }
+        "type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgba" if description.backdrop else "rgb",
+        "component_format": "float32", "rfilter": {"type": filter},
+    }  # fmt: skip
     camera: Plugin = {
-        **_lens(description),
-        "near_clip": 0.01,
-        "far_clip": 1e5,
-        "to_world": place(camera_to_world(description, width / height)),
-        "film": film,
-        "sampler": {"type": sampler},
-    }
+        **_lens(description), "near_clip": 0.01, "far_clip": 1e5,
+        "to_world": place(camera_to_world(description, width / height)), "film": film, "sampler": {"type": sampler},
+    }  # fmt: skip
     scene: Plugin = {"type": "scene", "camera": camera}
     if description.environment is not None:
         scene["environment"] = {
@@ -359,14 +293,13 @@ def refusing(description: SceneDescription) -> Iterator[None]:
         with fewer_warnings():
             yield
     except (RuntimeError, TypeError, ValueError) as error:
-        if not own and not any(isinstance(part, PluginPart) for part in description.parts):
+        if not own and not any(isinstance(part, parts.PluginPart) for part in description.parts):
             raise
         reason = " ".join(str(error).split())
         raise InputError(f"{description.object_name}: Mitsuba refuses the scene: {reason}; change it there") from error
 
 
 def _lens(description: SceneDescription) -> Plugin:
-    """The plugin of a camera, with what is before its place and its film."""
     model, drops = description.camera_model, description.number("camera.drops")
     if model is None:
         pinhole: Plugin = {"type": "perspective", "fov": description.number("camera.fov"), "fov_axis": "larger"}
@@ -387,17 +320,14 @@ def _lens(description: SceneDescription) -> Plugin:
     return camera
 
 
-CAMERA_NUMBERS = {
-    "shift_x": "principal_point_offset_x",
-    "shift_y": "principal_point_offset_y",
-    "aperture": "aperture_radius",
+CAMERA_NUMBERS = {  # what Mitsuba calls numbers of the camera, by the names of our inputs
+    "shift_x": "principal_point_offset_x", "shift_y": "principal_point_offset_y", "aperture": "aperture_radius",
     "focus": "focus_distance",
-}
-"""What Mitsuba calls numbers of the camera, by the names of our inputs."""
+}  # fmt: skip
 
 
-def camera_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
-    """The camera's inputs. Our field of view is along the larger side, Mitsuba's parameter along the width."""
+def scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
+    """The inputs of camera, environment and ground; our field of view is along the larger side, Mitsuba's the width."""
     height, width = resolution
 
     def along_width(value: Any) -> Any:
@@ -409,6 +339,10 @@ def camera_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         SceneInput("camera.fov", "camera.x_fov", along_width, shape=(1,)),
         SceneInput("camera.lens", "camera.lens", shape=(len(NUMBERS),)),
         *(SceneInput(f"camera.{name}", f"camera.{key}", number, shape=(1,)) for name, key in CAMERA_NUMBERS.items()),
+        # (H, W + 2, 3): a copy of the last column before the first, and of the first after the last
+        SceneInput("environment.padded", "environment.data", interior=True),
+        # (h, w, 3): of a ground that shows the environment's photograph (`advsearch.scene.grounds`)
+        SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", interior=True),
     )
 
 

@@ -25,31 +25,24 @@ from advsearch.scene.grounds import enclosed
 from advsearch.scene.mitsuba_backend import parts
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, repeating, sampling_weights, textured_emission
 from advsearch.scene.mitsuba_backend.transport import Paths, collect, first_hits
-from advsearch.scene.mitsuba_backend.variant import Plugin, Recordings, dr, media_in, mi, one_at_a_time, population
+from advsearch.scene.mitsuba_backend.variant import Plugin, Recordings, dr, mi, one_at_a_time, population
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
-from advsearch.scene.parts import PATTERN, LampGlass, plugins_in
+from advsearch.scene.parts import PATTERN, Lamp, LampGlass, plugins_in
 from advsearch.scene.surfaces import Surfaces
 
-MAX_DEPTH = 6
-"""Longest light path in segments: five bounces off surfaces."""
+MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
 NO_ROULETTE, ROULETTE = 1000, 2
 """Segments after which Russian roulette starts: never where paths soon leave the scene by themselves. Among houses it
 saves a third of the time without more noise; from 1 on, single gradients were a fifth off."""
-
-SHADOW_SPP = 4
-"""Samples a pixel of the material form's shadow term; without it a resting object's gradient has a cosine of 0.66."""
-
-BASE_COLOR = "object.base_color"
-"""Input: (h, w, 3) linear reflectance of the object, row 0 at v = 1 (top of the image)."""
-
-ENVIRONMENT_INPUT = parts.SceneInput("environment.padded", "environment.data", interior=True)
-"""(H, W + 2, 3): Mitsuba keeps a copy of the last column before the first, and of the first after the last."""
+SHADOW_SPP = 4  # samples a pixel of the shadow term; without it a resting object's gradient has a cosine of 0.66
+BASE_COLOR = "object.base_color"  # input: (h, w, 3) linear reflectance of the object, row 0 at v = 1 (top of the image)
 
 
 class MitsubaScene:
     """Renders one scene at one size.
 
     Attributes:
+        depth: longest light path in segments of the renders now.
         assembly: turns the inputs of a space into those of this scene.
         made: of what scene, and with which filter.
         names: every input that can be set.
@@ -87,8 +80,7 @@ class MitsubaScene:
             self.resolution = resolution
             self.sampler = sampler
             self.assembly = Assembly(description)
-            self.max_depth = max_depth
-            self._depth = max_depth
+            self.max_depth = self.depth = max_depth
             self._leave_out = frozenset(leave_out)
             unrecorded = description.thin_lens or any(map(textured_emission, description.meshes.values()))
             self._freeze = "tracing" in leave_out and not unrecorded  # Dr.Jit can record neither of these
@@ -113,8 +105,10 @@ class MitsubaScene:
                 for part in translated:
                     plugins |= part.plugins
                     self._path |= part.integrator
-                if "emitters" in leave_out:
-                    parts.leave_dark_lamps_out(plugins, description.parts)
+                if "emitters" in leave_out:  # a path that meets a dark lamp by chance still counts, should it be lit
+                    for lamp in description.parts:
+                        if isinstance(lamp, Lamp) and lamp.dark:
+                            plugins[lamp.name].get("emitter", plugins[lamp.name])["sampling_weight"] = 0.0
                 self._scene = mi.load_dict(plugins, optimize=False)
             self._sensor = self._scene.sensors()[0]
             self.parameters = mi.traverse(self._scene)
@@ -122,8 +116,7 @@ class MitsubaScene:
                 self.parameters[f"{name}.emitter.sampling_weight"] = weight
             self.parameters.update()
             self._integrators: dict[tuple[str, int], Any] = {}
-            of_parts = [declared for part in translated for declared in part.inputs]
-            inputs = [*parts.camera_inputs(resolution), ENVIRONMENT_INPUT, parts.GROUND_INPUT, *of_parts]
+            inputs = [*parts.scene_inputs(resolution), *(own for part in translated for own in part.inputs)]
             self.declared = {own.name: (key, own) for own in inputs if (key := parts.key_of(self.parameters, own))}
             self.names = frozenset(self.declared)
             self.interior = frozenset(name for name, (_, takes) in self.declared.items() if takes.interior)
@@ -132,15 +125,16 @@ class MitsubaScene:
             self._base: dict[str, Any] = {}
             self._applied: dict[str, Tensor] = {}
             self._recorded = Recordings()
-            media = media_in(self._scene) if self.volumetric else ()
-            population.add(self, self._scene, self._integrators, self.parameters, media=media)
+            bounds = self._scene.shapes() if self.volumetric else []
+            media = [side for shape in bounds for side in (shape.interior_medium(), shape.exterior_medium())]
+            held = self._scene, self._integrators, self.parameters
+            population.add(self, *held, media=tuple(medium for medium in media if medium is not None))
             self._every: dict[str, Tensor] = {}
             if "uploads" not in leave_out:
                 self._every = {name: self.base(name) for name in sorted(self.names)}
 
     def like(self, **changes: Any) -> MitsubaScene:
-        """Return another scene made as this one was, but with another `max_depth`, `sampler`, `integrator`, or
-        `leave_out`."""
+        """Return another scene made as this one was, but for `max_depth`, `sampler`, `integrator` or `leave_out`."""
         description, filter = self.made
         settings = {"max_depth": self.max_depth, "leave_out": self._leave_out, "sampler": self.sampler, **changes}
         other = MitsubaScene(description, self.resolution, filter=filter, **settings)
@@ -148,19 +142,14 @@ class MitsubaScene:
             other._integrator(what)  # one that comes later makes the recordings of all scenes stale
         return other
 
-    @property
-    def depth(self) -> int:
-        """Longest light path in segments of the renders now."""
-        return self._depth
-
     @contextmanager
     def shorter(self, depth: int | None) -> Iterator[None]:
         """Render light paths of at most `depth` segments inside the `with`; None changes nothing."""
-        before, self._depth = self._depth, self._depth if depth is None else min(depth, self.max_depth)
+        before, self.depth = self.depth, self.depth if depth is None else min(depth, self.max_depth)
         try:
             yield
         finally:
-            self._depth = before
+            self.depth = before
 
     def base(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh torch tensor of the input's shape."""
@@ -201,7 +190,7 @@ class MitsubaScene:
             media = population.media() if self.volumetric else []
             pictures: list[Tensor] = []
             for (what, seed), integrator in zip(seeds.items(), integrators, strict=True):
-                function = self._recorded.of((what, spp, self._depth), render, media) if self._freeze else render
+                function = self._recorded.of((what, spp, self.depth), render, media) if self._freeze else render
                 image = function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)).torch().clone()
                 if what == "guides":
                     image = image[..., -6:]
@@ -209,9 +198,9 @@ class MitsubaScene:
                 pictures.append(image)
             return pictures
 
-    def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int, *, hide: bool = False) -> Tensor:
-        """Render linear radiance, without what the environment shows directly if hidden; as of `pictures`."""
-        return self.pictures(inputs, {"hidden" if hide else "path": seed}, spp)[0]
+    def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
+        """Render linear radiance; as of `pictures`."""
+        return self.pictures(inputs, {"path": seed}, spp)[0]
 
     def guides(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> tuple[Tensor, Tensor]:
         """Render what guides the denoiser: first-hit albedo and shading normal, each (H, W, 3) float32."""
@@ -314,23 +303,11 @@ class MitsubaScene:
             from advsearch.scene.mitsuba_backend.material_adjoint import material_adjoint
 
             self._set(inputs)
-            names = list(meshes)
-            by_vertices, by_normals = material_adjoint(
-                self._scene,
-                self._sensor,
-                self.parameters,
-                names=names,
-                vertices=[inputs[f"{name}.vertices"] for name in names],
-                normals=[inputs[f"{name}.normals"] for name in names],
-                cotangent=cotangent,
-                seed=seed,
-                spp=spp,
-                max_depth=self._depth,
-                shadow_spp=SHADOW_SPP,
-            )
             population.changes += 1  # the first call loads integrators of its own
-            gradients = dict(zip((f"{name}.vertices" for name in names), by_vertices, strict=True))
-            return gradients | dict(zip((f"{name}.normals" for name in names), by_normals, strict=True))
+            moving = [f"{name}.{what}" for name in meshes for what in ("vertices", "normals")]
+            counts = {"seed": seed, "spp": spp, "max_depth": self.depth, "shadow_spp": SHADOW_SPP}
+            held = self._scene, self._sensor, self.parameters
+            return material_adjoint(*held, {name: inputs[name] for name in moving}, cotangent=cotangent, **counts)
 
     def transport(self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int) -> Paths:
         """Return what the vertices of light paths add to their pixels for a unit more of an input that is a base
@@ -344,7 +321,7 @@ class MitsubaScene:
             part = name.partition(".")[0]
             emitters = {emitter.id(): emitter for emitter in self._scene.emitters()}
             projector = emitters.get(part) if name.endswith(PATTERN) else None
-            paths = collect(self._scene, self.parameters, key, noise, self.resolution, self._depth, spp, projector)
+            paths = collect(self._scene, self.parameters, key, noise, self.resolution, self.depth, spp, projector)
             size, surface = self.parameters[key].shape[:2], None
             if projector is None:
                 surface = self.made[0].meshes[part].surface
@@ -412,17 +389,14 @@ class MitsubaScene:
             self.parameters.update()
 
     def _integrator(self, method: str) -> Any:
-        """Return the integrator of one method for the paths that are rendered now, made on first use."""
-        key = method, self._depth
+        key = method, self.depth
         if key not in self._integrators:
-            path = {"type": "prb", "max_depth": self._depth, "rr_depth": self.roulette, **self._path}
-            projective = {"type": "prb_projective", "max_depth": self._depth, "rr_depth": NO_ROULETTE}
+            path = {"type": "prb", "max_depth": self.depth, "rr_depth": self.roulette, **self._path}
+            projective = {"type": "prb_projective", "max_depth": self.depth, "rr_depth": NO_ROULETTE}
             recipes: dict[str, Plugin] = {
-                "path": path,
-                "hidden": {**path, "hide_emitters": True},
-                "guides": self._guides,
+                "path": path, "hidden": {**path, "hide_emitters": True}, "guides": self._guides,
                 "boundary": {**projective, "guiding": "none"},
-            }
+            }  # fmt: skip
             self._integrators[key] = mi.load_dict(recipes[method])
             population.changes += 1
         return self._integrators[key]

@@ -6,6 +6,7 @@ Lengths are in object sizes, so that everything is moved and scaled with the obj
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -20,42 +21,17 @@ from advsearch.scene.importing.geometry import assemble, join
 from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene
 from advsearch.scene.importing.texture import textured
+from advsearch.scene.mitsuba_backend import shapes
 from advsearch.scene.mitsuba_backend.meshes import plain, with_inner
-from advsearch.scene.mitsuba_backend.shapes import (
-    MESHES,
-    OF_A_SHAPE,
-    ShapeMesh,
-    ShapeSurface,
-    constant,
-    haze_in,
-    mesh_of,
-    pose_of,
-    surface_of,
-)
 from advsearch.scene.mitsuba_backend.variant import Plugin
-from advsearch.scene.mitsuba_backend.xml_files import read_scene, trusted
+from advsearch.scene.mitsuba_backend.xml_files import INTEGRATORS, LIGHTS, MEDIA, SENSORS, SHAPES, read_scene, trusted
 from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
 
-SHAPES = frozenset(
-    "rectangle cube sphere cylinder disk obj ply serialized instance shapegroup sdfgrid bsplinecurve linearcurve "
-    "ellipsoids ellipsoidsmesh merge".split()
-)
-LIGHTS = frozenset("constant envmap point spot directional projector sunsky timed_sunsky area directionalarea".split())
-SENSORS = frozenset("perspective thinlens orthographic radiancemeter irradiancemeter distant batch".split())
 CAMERAS = frozenset(("perspective", "thinlens"))
-INTEGRATORS = frozenset(
-    "path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov ptracer depth moment stokes".split()
-)
-NOTHING = {"type": "null"}
-"""The surface of what only bounds a medium."""
-MEDIA = frozenset(("homogeneous", "heterogeneous"))
+NOTHING = {"type": "null"}  # the surface of what only bounds a medium
 Y_TO_Z = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-MOST_PARTS = 2000
-"""Plugins at the top of a scene."""
-DIAGONAL = math.hypot(36.0, 24.0)
-"""Of the film of which Mitsuba's `focal_length` speaks, millimetres."""
-
-
+MOST_PARTS = 2000  # plugins at the top of a scene
+DIAGONAL = math.hypot(36.0, 24.0)  # of the film of which Mitsuba's `focal_length` speaks, millimetres
 NUMBERS: Mapping[str, tuple[tuple[int, ...], str]] = {
     **dict.fromkeys(("radius", "fov", "width", "height"), ((), "a number")),
     **dict.fromkeys(("center", "p0", "p1", "position", "direction"), ((3,), "three numbers")),
@@ -88,11 +64,7 @@ def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
 
 
 def _check_numbers(plugin: Mapping[str, object], where: str) -> None:
-    """Check that numbers stand where they are read here; what else a plugin has is for Mitsuba to refuse.
-
-    Raises:
-        InputError: one is a text, a colour or the like.
-    """
+    """Check that numbers stand where they are read here; what else a plugin has is for Mitsuba to refuse."""
     for key, value in plugin.items():
         if isinstance(value, Mapping) and value.get("type", "rgb") not in ("rgb", "spectrum"):  # of whatever name
             _check_numbers(value, where if plugin["type"] != "scene" else f"{where}: {shown(key, quoted=False)}")
@@ -120,14 +92,12 @@ class PluginContents:
 
 
 def contents(path: Path) -> PluginContents:
-    """Return what is understood of a scene file.
-
-    Raises:
-        FileFormatError: as for `read_tree`.
-    """
+    """Return what is understood of a scene file; it is refused as of `read_tree`."""
     named = dict(_plugins(read_tree(path)[0]))
     kinds = {name: str(plugin["type"]) for name, plugin in named.items()}
-    objects = tuple(name for name, kind in kinds.items() if kind in MESHES and named[name].get("bsdf") != NOTHING)
+    objects = tuple(
+        name for name, kind in kinds.items() if kind in shapes.MESHES and named[name].get("bsdf") != NOTHING
+    )
     cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
     known, unkept = {*objects, *cameras}, INTEGRATORS | SENSORS
     kept = {name: kind for name, kind in kinds.items() if name not in known and kind not in unkept}
@@ -136,16 +106,11 @@ def contents(path: Path) -> PluginContents:
 
 
 def _free(name: str) -> str:
-    """A name, or another one where the house has taken it."""
     return f"{name}-2" if name in TAKEN else name
 
 
 def _shines(plugin: Mapping[str, object]) -> bool:
     return any(inner.get("type") in LIGHTS for inner in plugins_in(plugin))
-
-
-def _letters(name: str) -> str:
-    return "".join(sign for sign in name.casefold() if sign.isalnum())
 
 
 def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedScene:
@@ -168,7 +133,8 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     where = scene.name if isinstance(scene, Path) else "scene"
     named = dict(_plugins(tree))
     ids = [name for name, plugin in named.items() if plugin["type"] in SHAPES]
-    alike = [name for name in ids if _letters(name) == _letters(wanted)]
+    letters = {name: "".join(filter(str.isalnum, name.casefold())) for name in (*ids, wanted)}
+    alike = [name for name in ids if letters[name] == letters[wanted]]
     if wanted not in ids and len(alike) == 1:
         wanted = alike[0]
     if wanted not in ids:
@@ -176,28 +142,23 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     if len(named) > MOST_PARTS:
         raise InputError(f"{where}: expected at most {MOST_PARTS} plugins at the top, got {len(named)}; join meshes")
     shape = named[wanted]
-    surface, triangles = surface_of(_bsdf(shape, named)), mesh_of(shape, wanted)
+    surface, (mesh, own_uvs) = shapes.surface_of(_bsdf(shape, named)), shapes.mesh_of(shape, wanted)
     placed = [plugin for plugin in named.values() if plugin["type"] in SENSORS and "to_world" in plugin]
-    upper = abs(pose_of(placed[0])[:3, 1]) if placed else np.array([0.0, 1.0, 0.0])  # of the first camera's side
-    frame = _ObjectFrame(triangles.mesh, wanted, z_up=bool(upper[2] > upper[1]))
-    haze, used = haze_in(named, frame.matrix) or (None, frozenset[str]())
+    upper = abs(shapes.pose_of(placed[0])[:3, 1]) if placed else np.array([0.0, 1.0, 0.0])  # of the first camera's side
+    frame = _ObjectFrame(mesh, wanted, z_up=bool(upper[2] > upper[1]))
+    haze, used = shapes.haze_in(named, frame.matrix) or (None, frozenset[str]())
     light = _light(shape)
     left_out = _left_out(tree, shape, hazy=haze is not None, lit=light is not None)
-    missing = _missing_attributes(surface.plugin, triangles.mesh)
+    missing = _missing_attributes(surface.plugin, mesh)
     notes += [f"{where}: {clause}" for clause in (*left_out, *surface.notes, *missing)]
     source = scene if isinstance(scene, Path) else Path("scene.xml")
-    mesh, base_color = _painted(frame.turned(triangles), surface, str(shape["type"]), where)
+    turn = frame.turn.astype(np.float32)
+    mesh = replace(mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T)  # z up
+    mesh, base_color = _painted(mesh, own_uvs, surface, str(shape["type"]), where)
     made = ObjectAsset(
-        name=f"{safe_name(source)}-{clean(wanted)}",
-        mesh=normalised(mesh),
-        base_color=base_color,
-        source=str(source),
-        warnings=tuple(notes),
-        up=UpAxis("z"),
-        surface=surface.plugin,
-        emission=light,
-        extent=frame.size,
-    )
+        name=f"{safe_name(source)}-{clean(wanted)}", mesh=normalised(mesh), base_color=base_color, source=str(source),
+        warnings=tuple(notes), up=UpAxis("z"), surface=surface.plugin, emission=light, extent=frame.size,
+    )  # fmt: skip
     around: list[ScenePart] = [] if haze is None else [haze]
     cameras: dict[str, PlacedCamera] = {}
     for name, plugin in named.items():
@@ -210,27 +171,25 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     return ImportedScene(made, tuple(around), cameras)
 
 
-def _painted(shape: ShapeMesh, surface: ShapeSurface, kind: str, where: str) -> tuple[Mesh, Floats]:
+def _painted(mesh: Mesh, own_uvs: bool, surface: shapes.ShapeSurface, kind: str, where: str) -> tuple[Mesh, Floats]:
     """Return a shape's mesh with texture coordinates for its base colour, and that.
 
     Where anything is looked up by the mesh's own, or by its attributes, they stay. A shape of one colour gets new ones
     where its own do not tell its places apart, as on a cube.
     """
-    mesh = shape.mesh
     if surface.picture or surface.bound:
         down = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
         down = down @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
         return replace(mesh, uvs=(down * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)), surface.base_color
-    own = shape.uv and kind not in ("cube", "sphere", "cylinder", "disk")
+    own_uvs &= kind not in ("cube", "sphere", "cylinder", "disk")
     vertices, normals, uvs = (values.astype(np.float64) for values in (mesh.vertices, mesh.normals, mesh.uvs))
     color = ImportedSurface(color=surface.base_color[0, 0])
-    part = ImportedPart(vertices, mesh.faces.astype(np.int64), normals, uvs if own else None, None, color)
+    part = ImportedPart(vertices, mesh.faces.astype(np.int64), normals, uvs if own_uvs else None, None, color)
     soup, maps = textured(join([part], where, y_up=False), [color], Notes(where))
     return assemble(soup)[0], maps.color
 
 
 def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, object]]]:
-    """The plugins at the top of a scene, by name."""
     return ((name, one) for name, one in tree.items() if isinstance(one, Mapping) and "type" in one)
 
 
@@ -269,7 +228,7 @@ def _light(shape: Mapping[str, object]) -> Floats | None:
     """The radiance (1, 1, 3) of a shape that shines evenly; None of any other."""
     for inner in shape.values():
         if isinstance(inner, Mapping) and inner["type"] == "area" and set(inner) <= {"type", "id", "radiance"}:
-            radiance = constant(inner.get("radiance"))
+            radiance = shapes.constant(inner.get("radiance"))
             if radiance is not None and 0.0 < radiance.max() <= BRIGHTEST and radiance.min() >= 0.0:
                 return radiance.reshape(1, 1, 3)
     return None
@@ -310,7 +269,7 @@ def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: 
             if any("principal_point" in key for key in plugin):
                 yield f"the sensor {name} looks along its middle: its principal point is left out"
     for key, inner in shape.items():
-        if not isinstance(inner, Mapping) and key not in OF_A_SHAPE:
+        if not isinstance(inner, Mapping) and key not in shapes.OF_A_SHAPE:
             yield f"the object's {shown(key)} is left out: a {shape['type']} has none"
         if isinstance(inner, Mapping) and inner["type"] in LIGHTS and not lit:
             yield "the object's own light is left out"
@@ -333,48 +292,38 @@ class _ObjectFrame:
         move[:3, 3] = (-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2])
         self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ move @ turn
 
-    def turned(self, shape: ShapeMesh) -> ShapeMesh:
-        """Return a mesh with z up."""
-        turn = self.turn.astype(np.float32)
-        mesh = replace(shape.mesh, vertices=shape.mesh.vertices @ turn.T, normals=shape.mesh.normals @ turn.T)
-        return replace(shape, mesh=mesh)
-
-    def moved(self, plugin: Mapping[str, object]) -> Plugin:
-        """Return a plugin at the top of a scene in its place."""
+    def moved(self, plugin: Mapping[str, object], *, top: bool = True) -> Plugin:
+        """Return a plugin at the top of a scene, or within another, in its place; media are scaled everywhere."""
         kind, entries = plugin["type"], dict(plugin)
-        if kind == "merge":
+        if kind in MEDIA:
+            entries["scale"] = float(np.asarray(entries.get("scale", 1.0))) * self.size
+        elif kind in ("gridvolume", "constvolume"):
+            entries["to_world"] = self.matrix @ shapes.pose_of(plugin)
+        elif not top:
+            pass
+        elif kind == "merge":
             return with_inner(entries, self.moved)
-        if kind in SHAPES - {"shapegroup", "merge"}:
-            entries["to_world"] = self.matrix @ pose_of(plugin)
+        elif kind in SHAPES - {"shapegroup"}:
+            entries["to_world"] = self.matrix @ shapes.pose_of(plugin)
         elif kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
             turn = np.eye(4)
             turn[:3, :3] = self.turn
             if "direction" in entries:
                 entries["direction"] = (self.turn @ np.asarray(entries["direction"], dtype=np.float64)).tolist()
             elif kind != "constant":
-                entries["to_world"] = turn @ pose_of(plugin)
+                entries["to_world"] = turn @ shapes.pose_of(plugin)
         elif kind in ("point", "spot", "projector"):
             if "position" in entries:
                 place = np.asarray(entries["position"], dtype=np.float64)
                 entries["position"] = (self.matrix[:3, :3] @ place + self.matrix[:3, 3]).tolist()
             else:
-                entries["to_world"] = self.matrix @ pose_of(plugin)
+                entries["to_world"] = self.matrix @ shapes.pose_of(plugin)
             power = "irradiance" if kind == "projector" else "intensity"
             entries[power] = _times(entries.get(power, 1.0), self.size**-2, str(kind))
-        return with_inner(entries, self._inside)
-
-    def _inside(self, plugin: Mapping[str, object]) -> Plugin:
-        """Return a plugin within another: media and volumes are scaled."""
-        entries = dict(plugin)
-        if plugin["type"] in MEDIA:
-            entries["scale"] = float(np.asarray(entries.get("scale", 1.0))) * self.size
-        if plugin["type"] in ("gridvolume", "constvolume"):
-            entries["to_world"] = self.matrix @ pose_of(plugin)
-        return with_inner(entries, self._inside)
+        return with_inner(entries, lambda inner: self.moved(inner, top=False))
 
 
 def _times(value: object, factor: float, kind: str) -> object:
-    """A power times a factor."""
     if isinstance(value, (int, float)):
         return float(value) * factor
     if isinstance(value, Mapping):
@@ -393,7 +342,7 @@ def _times(value: object, factor: float, kind: str) -> object:
 
 
 def _camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PlacedCamera:
-    matrix = frame.matrix @ pose_of(sensor)
+    matrix = frame.matrix @ shapes.pose_of(sensor)
     matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
     inner = [entry for entry in sensor.values() if isinstance(entry, Mapping)]
     film = next((plugin for plugin in inner if "film" in str(plugin["type"])), {})
@@ -402,24 +351,13 @@ def _camera(sensor: Mapping[str, object], frame: _ObjectFrame) -> PlacedCamera:
         raise InputError(f"camera: expected a film of at least 1 x 1 pixels, got {width:g} x {height:g}")
     axis, degrees = str(sensor.get("fov_axis", "x")), float(np.asarray(sensor.get("fov", 0.0)))
     if not degrees:
-        length = float(millimetres(str(sensor.get("focal_length", "50mm"))))
+        text, length = str(sensor.get("focal_length", "50mm")), 0.0
+        with contextlib.suppress(ValueError):
+            length = float(text.removesuffix("mm"))
+        if not length > 0.0:
+            raise InputError(f"focal_length: expected millimetres, such as 50mm, got {text!r}")
         axis, degrees = "diagonal", 2.0 * math.degrees(math.atan(DIAGONAL / (2.0 * length)))
     larger, smaller = max(width, height), min(width, height)
     across = {"x": width, "y": height, "diagonal": math.hypot(width, height), "larger": larger, "smaller": smaller}
     half = math.tan(math.radians(degrees) / 2.0) * larger / across.get(axis, width)
     return PlacedCamera(matrix, 2.0 * math.degrees(math.atan(half)))
-
-
-def millimetres(text: str) -> float:
-    """The number of ``50mm``.
-
-    Raises:
-        InputError: there is none.
-    """
-    try:
-        length = float(text.removesuffix("mm"))
-    except ValueError:
-        length = 0.0
-    if not length > 0.0:
-        raise InputError(f"focal_length: expected millimetres, such as 50mm, got {text!r}")
-    return length

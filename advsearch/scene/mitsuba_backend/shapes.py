@@ -16,40 +16,24 @@ from advsearch.scene.parts import BASE_COLOR, HazePart, plugins_in
 
 Buffers = tuple[Doubles, Ints, Doubles | None, Doubles | None, dict[str, Floats]]
 """Vertices, faces, normals and texture coordinates of a mesh, and its attributes, (V or F, n) by their names."""
-
-BARE = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
-"""Texture coordinates of a face that has none, as Mitsuba takes them."""
-SECTIONS = 64
-"""Sides of a round shape."""
-SOLIDS = ("rectangle", "sphere", "cylinder", "disk")
-"""Shapes of which Mitsuba has no triangles."""
-MESHES = (*SOLIDS, "cube", "obj", "ply", "serialized")
-"""The shapes that can be the object."""
-OF_A_MESH = frozenset(
+BARE = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))  # texture coordinates of a face that has none, as Mitsuba takes them
+SECTIONS = 64  # sides of a round shape
+SOLIDS = ("rectangle", "sphere", "cylinder", "disk")  # shapes of which Mitsuba has no triangles
+MESHES = (*SOLIDS, "cube", "obj", "ply", "serialized")  # the shapes that can be the object
+OF_A_MESH = frozenset(  # entries of a mesh that are no surface, light or medium
     ("type", "filename", "to_world", "face_normals", "flip_tex_coords", "flip_normals", "shape_index")
 )
-"""Entries of a mesh that are no surface, light or medium."""
 OF_A_SHAPE = OF_A_MESH | {"id", "radius", "center", "p0", "p1", "sampling_weight", "silhouette_sampling_weight"}
 """The same of any shape."""
 
 
-@dataclass(frozen=True, eq=False)
-class ShapeMesh:
-    """The triangles of a shape in its scene, as Mitsuba has them, with the file's own texture coordinates, which may
-    leave the unit square, and attributes; and whether it has such coordinates: else they are `BARE` on each face."""
-
-    mesh: Mesh
-    uv: bool = True
-
-
-def mesh_of(shape: Mapping[str, object], name: str) -> ShapeMesh:
-    """Return the triangles of a shape's dictionary; its name is for errors.
+def mesh_of(shape: Mapping[str, object], name: str) -> tuple[Mesh, bool]:
+    """Return the triangles of a shape's dictionary in its scene, with the file's own texture coordinates, which may
+    leave the unit square, and attributes; and whether it has such coordinates: else they are `BARE` on each face. Its
+    name is for errors.
 
     Where Mitsuba has a mesh, it is Mitsuba's own; round shapes become triangles here. Of a mesh with `face_normals`, or
-    without texture coordinates, every face has vertices of its own.
-
-    Raises:
-        InputError: it has none.
+    without texture coordinates, every face has vertices of its own. A shape without triangles is refused.
     """
     kind = str(shape["type"])
     if kind not in MESHES:
@@ -57,10 +41,14 @@ def mesh_of(shape: Mapping[str, object], name: str) -> ShapeMesh:
     vertices, faces, normals, uvs, attributes = _solid(kind, shape, name) if kind in SOLIDS else _loaded(shape, name)
     if not np.isfinite(vertices).all():
         raise InputError(f"object {name}: expected finite vertices, got NaN or infinite ones; repair the mesh")
+
+    def of(some: Ints) -> dict[str, Floats]:
+        return {key: values[some] if key.startswith("vertex_") else values for key, values in attributes.items()}
+
     own_uvs, flat = uvs is not None, normals is None or bool(shape.get("face_normals"))
     if uvs is None or normals is None or flat:
         corners = faces.reshape(-1)
-        attributes = _of(corners, attributes)
+        attributes = of(corners)
         vertices, faces = vertices[corners], np.arange(len(corners)).reshape(-1, 3)
         faced = _unit(face_vectors(vertices[faces])).repeat(3, axis=0)
         normals = faced if flat or normals is None else normals[corners]
@@ -72,17 +60,10 @@ def mesh_of(shape: Mapping[str, object], name: str) -> ShapeMesh:
     if np.einsum("fk,fck->", face_vectors(vertices[faces]), normals[faces]) < 0.0:
         faces = faces[:, ::-1]  # Mitsuba shades by the normals, whichever way faces are wound
     places, facing, texture = (values.astype(np.float32) for values in (vertices, normals, uvs))
-    made = Mesh(places, np.ascontiguousarray(faces, np.uint32), facing, texture, _of(used, attributes))
-    return ShapeMesh(made, own_uvs)
-
-
-def _of(vertices: Ints, attributes: Mapping[str, Floats]) -> dict[str, Floats]:
-    """The attributes of some of the vertices, in their order, and of all faces."""
-    return {key: values[vertices] if key.startswith("vertex_") else values for key, values in attributes.items()}
+    return Mesh(places, np.ascontiguousarray(faces, np.uint32), facing, texture, of(used)), own_uvs
 
 
 def _loaded(shape: Mapping[str, object], name: str) -> Buffers:
-    """Return what Mitsuba reads of a mesh."""
     try:
         with fewer_warnings():
             loaded = mi.load_dict(loadable({key: value for key, value in shape.items() if key in OF_A_MESH}))
@@ -111,21 +92,24 @@ def _unit(vectors: Doubles) -> Doubles:
 
 
 def _solid(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
-    """The same of a shape of which Mitsuba has no triangles."""
-    local = np.eye(4)
+    local, radius = np.eye(4), float(np.asarray(shape.get("radius", 1.0), np.float64))
     turn = np.linspace(0.0, 1.0, SECTIONS + 1)
     normals = None
     if kind == "sphere":
         uvs, faces = _grid(turn, turn[::2])
         down = np.pi * uvs[:, 1]
         vertices = normals = np.stack([*(np.sin(down) * _circle(uvs[:, 0])), np.cos(down)], axis=1)
-        local[:3, :3] *= _number(shape.get("radius", 1.0))
-        local[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), dtype=np.float64)
+        local[:3, :3] *= radius
+        local[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), np.float64)
     elif kind == "cylinder":  # open at both ends, as Mitsuba's
         uvs, faces = _grid(turn, np.array([0.0, 1.0]))
         vertices = np.stack([*_circle(uvs[:, 0]), uvs[:, 1]], axis=1)
         normals = vertices * (1.0, 1.0, 0.0)
-        local = _along(shape)
+        low, high = (np.asarray(shape.get(end, (0.0, 0.0, z)), np.float64) for end, z in (("p0", 0.0), ("p1", 1.0)))
+        length = float(np.linalg.norm(high - low))
+        along = (high - low) / max(length, 1e-30)
+        aside, across = (np.array(axis, np.float64)[:, 0] for axis in mi.coordinate_system(mi.Vector3f(along)))
+        local[:3] = np.stack([aside * radius, across * radius, along * length, low], axis=1)
     elif kind == "disk":
         uvs, faces = _grid(turn[::8], turn)
         vertices = np.stack([*(uvs[:, 0] * _circle(uvs[:, 1])), np.zeros(len(uvs))], axis=1)
@@ -142,7 +126,6 @@ def _solid(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
 
 
 def _grid(u: Doubles, v: Doubles) -> tuple[Doubles, Ints]:
-    """The points (N, 2) of a grid of texture coordinates, and its triangles (F, 3)."""
     points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     first = (np.arange(len(v) - 1)[:, None] * len(u) + np.arange(len(u) - 1)).reshape(-1)
     above = first + len(u)
@@ -151,42 +134,16 @@ def _grid(u: Doubles, v: Doubles) -> tuple[Doubles, Ints]:
 
 
 def _circle(share: Doubles) -> Doubles:
-    """Points (2, N) of the unit circle, at shares (N,) of a whole turn."""
     return np.asarray([np.cos(2.0 * np.pi * share), np.sin(2.0 * np.pi * share)])
 
 
-def _along(shape: Mapping[str, object]) -> Doubles:
-    """The transform (4, 4) of a cylinder between its two points; around it as Mitsuba's (Duff et al. 2017)."""
-    low = np.asarray(shape.get("p0", (0.0, 0.0, 0.0)), dtype=np.float64)
-    high = np.asarray(shape.get("p1", (0.0, 0.0, 1.0)), dtype=np.float64)
-    length = float(np.linalg.norm(high - low))
-    x, y, z = along = (high - low) / max(length, 1e-30)
-    sign = np.copysign(1.0, z)
-    a = -1.0 / (sign + z)
-    aside = np.array([1.0 + sign * x * x * a, sign * x * y * a, -sign * x])
-    across = np.array([x * y * a, sign + y * y * a, -y])
-    radius = _number(shape.get("radius", 1.0))
-    own = np.eye(4)
-    own[:3] = np.stack([aside * radius, across * radius, along * length, low], axis=1)
-    return own
-
-
-def _number(value: object) -> float:
-    return float(np.asarray(value, dtype=np.float64))
-
-
 def pose_of(plugin: Mapping[str, object]) -> Doubles:
-    """Return the pose (4, 4) of a plugin."""
     return np.asarray(plugin.get("to_world", np.eye(4)), dtype=np.float64)
 
 
 Plugins = Mapping[str, Mapping[str, object]]
-
-MOST, DARKEST = 2.0, 1e-3
-"""Of a haze: the largest extinction per object size, and the least share of the light that is scattered."""
-OFF = 0.05
-"""By what share of its radius the ball's middle may lie beside the object's; its edge is in the far background."""
-
+MOST, DARKEST = 2.0, 1e-3  # of a haze: largest extinction per object size, and least share of light scattered
+OFF = 0.05  # share of its radius by which the ball's middle may lie beside the object's; its edge is far off
 _OF_BALL = {"type", "id", "radius", "center", "to_world", "bsdf", "interior"}
 _OF_MEDIUM = {"type", "id", "sigma_t", "albedo", "scale", "phase"}
 
@@ -232,71 +189,48 @@ def _reference(plugin: object) -> str | None:
 def _numbers(value: object) -> Doubles:
     """Return a number (1,), or the three of a colour; NaN of anything else."""
     if isinstance(value, Mapping):
-        plain = value.get("type") in ("rgb", "uniform") and set(value) <= {"type", "value"}
-        value = value.get("value") if plain else None
+        value = value.get("value") if value["type"] in ("rgb", "uniform", "spectrum", "srgb") else None
     try:
-        numbers = np.atleast_1d(np.asarray(value, np.float64))
-    except (TypeError, ValueError):
+        numbers = np.atleast_1d(np.asarray(None if isinstance(value, (str, bool)) else value, np.float64))
+    except (TypeError, ValueError):  # such as pairs of wavelength and value
         return np.full(1, np.nan)
     return numbers if numbers.shape in ((1,), (3,)) and np.isfinite(numbers).all() else np.full(1, np.nan)
 
 
 # ---- The surface of a Mitsuba shape: its base colour, which is searched, and all the rest as it is ------------------
 
-COLORS = {
-    "diffuse": "reflectance",
-    "principled": "base_color",
-    "principledthin": "base_color",
-    "plastic": "diffuse_reflectance",
-    "roughplastic": "diffuse_reflectance",
-    "pplastic": "diffuse_reflectance",
-}
-"""Surfaces with a base colour, and its name there."""
-GREY = 0.5
-"""Reflectance where a surface says none: Mitsuba's default."""
-PLAIN_SIZE = 8
-"""Texels of each side of a base colour that is the same everywhere."""
-SHARP_SIZE = 256
-"""Smallest side of a base colour whose texels are not interpolated: smaller ones are repeated."""
-PLACED = frozenset(("bitmap", "checkerboard"))
-"""Textures that are looked up by texture coordinates, after a transform of their own."""
+COLORS = {  # surfaces with a base colour, and its name there
+    "diffuse": "reflectance", "principled": "base_color", "principledthin": "base_color",
+    "plastic": "diffuse_reflectance", "roughplastic": "diffuse_reflectance", "pplastic": "diffuse_reflectance",
+}  # fmt: skip
+GREY = 0.5  # reflectance where a surface says none: Mitsuba's default
+PLAIN_SIZE = 8  # texels of each side of a base colour that is the same everywhere
+SHARP_SIZE = 256  # smallest side of a base colour whose texels are not interpolated: smaller ones are repeated
+PLACED = frozenset(("bitmap", "checkerboard"))  # looked up by texture coordinates, after a transform of their own
 BOUND = PLACED | {"mesh_attribute", "normalmap", "bumpmap", "hair"}
 """What shows something else on a mesh with other texture coordinates, or without its attributes."""
-ANISOTROPIC = frozenset(("alpha_u", "alpha_v", "anisotropic"))
-"""Numbers of surfaces that look different along u and along v."""
+ANISOTROPIC = frozenset(("alpha_u", "alpha_v", "anisotropic"))  # numbers of what looks different along u and v
 OF_THE_PICTURE = frozenset(("type", "id", "bitmap", "filename", "raw", "format", "to_uv"))
 """Entries of a bitmap that the picture itself has, once it is read."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeSurface:
-    """What a shape looks like.
+    """What a shape looks like."""
 
-    Attributes:
-        plugin: its dictionary, with `{"type": BASE_COLOR}` and how the texture is looked up (`wrap_mode`,
-            `filter_type`) in the place of the base colour, if it has such a place.
-        base_color: (H, W, 3) float32 display-referred, row 0 on top; `GREY` where there is no place for one.
-        picture: it differs from place to place.
-        to_uv: (3, 3) from the mesh's texture coordinates to those of the base colour and of `plugin`, v downwards.
-        bound: the mesh must keep its own texture coordinates and attributes.
-        notes: clauses about what is not as in the scene.
-    """
-
+    # its dictionary, with `{"type": BASE_COLOR}` and how the texture is looked up (`wrap_mode`, `filter_type`) in the
+    # place of the base colour, if it has such a place
     plugin: Plugin
-    base_color: Floats
-    picture: bool
+    base_color: Floats  # (H, W, 3) float32 display-referred, row 0 on top; `GREY` where there is no place for one
+    picture: bool  # it differs from place to place
+    # (3, 3) from the mesh's texture coordinates to those of the base colour and of `plugin`, v downwards
     to_uv: Doubles
-    bound: bool
-    notes: tuple[str, ...]
+    bound: bool  # the mesh must keep its own texture coordinates and attributes
+    notes: tuple[str, ...]  # clauses about what is not as in the scene
 
 
-@dataclass(frozen=True, eq=False)
-class _Color:
-    """A base colour: linear (H, W, 3), and the entries that say how it is looked up."""
-
-    linear: Floats
-    options: Plugin
-    to_uv: object = None
+Color = tuple[Floats, Plugin, object]
+"""A base colour: linear (H, W, 3), the entries that say how it is looked up, and a transform of its own or None."""
 
 
 def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
@@ -305,29 +239,29 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
     Whatever else is looked up by texture coordinates stays in its place: where the base colour has a transform of its
     own, the others get the inverse before theirs.
     """
-    base: _Color | None = None
+    base: Color | None = None
 
     def without(plugin: Mapping[str, object]) -> Plugin:
         nonlocal base
         key = COLORS.get(str(plugin["type"]))
         color = None if key is None or base is not None else _color(plugin.get(key, GREY))
         if key is not None and color is not None:
-            base, plugin = color, {**plugin, key: {"type": BASE_COLOR, **color.options}}
+            base, plugin = color, {**plugin, key: {"type": BASE_COLOR, **color[1]}}
         return with_inner(plugin, without)
 
     surface = without(bsdf)
-    color = base or _Color(np.full((PLAIN_SIZE, PLAIN_SIZE, 3), GREY, np.float32), {})
+    linear, _, placed = base or (np.full((PLAIN_SIZE, PLAIN_SIZE, 3), GREY, np.float32), {}, None)
     notes, plugins = [], list(plugins_in(surface))
     types = {str(plugin["type"]) for plugin in plugins}
     if BASE_COLOR not in types:
         kinds = sorted(types & {"mesh_attribute", "volume"})
         why = f"its colour is a {kinds[0]}" if kinds else f"a {surface['type']} has none"
         notes.append(f"it has no base colour that can be searched ({why}): not for texture, patch and material")
-    if not (color.linear.min() >= 0.0 and color.linear.max() <= 1.0 + 1e-4):
+    if not (linear.min() >= 0.0 and linear.max() <= 1.0 + 1e-4):
         notes.append("its base colour is cut to reflectances from 0 to 1")
-    picture = color.linear.shape[:2] != (PLAIN_SIZE, PLAIN_SIZE) or bool(np.ptp(color.linear, axis=(0, 1)).any())
+    picture = linear.shape[:2] != (PLAIN_SIZE, PLAIN_SIZE) or bool(np.ptp(linear, axis=(0, 1)).any())
     bound = any(plugin["type"] in BOUND or ANISOTROPIC & set(plugin) for plugin in plugins)
-    to_uv = np.eye(3) if color.to_uv is None else uv_matrix(color.to_uv)
+    to_uv = np.eye(3) if placed is None else uv_matrix(placed)
     # The mesh's texture coordinates can be transformed where that can be undone, and the tangents along u stay
     tangents = types & {"normalmap", "hair"} or any(ANISOTROPIC & set(plugin) for plugin in plugins)
     stays = not tangents or (to_uv[1, 0] == 0.0 and to_uv[0, 0] > 0.0)
@@ -335,7 +269,7 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
         surface, to_uv = _with_transform(surface, to_uv, BASE_COLOR), np.eye(3)
     elif not np.array_equal(to_uv, np.eye(3)):
         surface = _with_transform(surface, np.asarray(np.linalg.inv(to_uv), np.float64), *PLACED)
-    base_color = linear_to_srgb(np.clip(color.linear, 0.0, 1.0))
+    base_color = linear_to_srgb(np.clip(linear, 0.0, 1.0))
     return ShapeSurface(surface, base_color, picture, to_uv, bound, tuple(notes))
 
 
@@ -355,11 +289,10 @@ def uv_matrix(value: object) -> Doubles:
     return matrix if matrix.shape == (3, 3) else matrix[np.ix_((0, 1, 3), (0, 1, 3))]
 
 
-def _color(value: object) -> _Color | None:
-    """A constant, a picture or a checkerboard as a base colour."""
+def _color(value: object) -> Color | None:
     plain = constant(value)
     if plain is not None:
-        return _Color(np.broadcast_to(plain, (PLAIN_SIZE, PLAIN_SIZE, 3)), {})
+        return np.broadcast_to(plain, (PLAIN_SIZE, PLAIN_SIZE, 3)), {}, None
     if not isinstance(value, Mapping):
         return None
     if value["type"] == "checkerboard":
@@ -368,13 +301,13 @@ def _color(value: object) -> _Color | None:
         if dark is None or light is None or rest:
             return None
         board = np.array([[dark, light], [light, dark]], np.float32)
-        return _Color(_repeated(board), {"filter_type": "nearest"}, value.get("to_uv"))
+        return _repeated(board), {"filter_type": "nearest"}, value.get("to_uv")
     picture = _pixels(value) if value["type"] == "bitmap" else None
     if picture is None:
         return None
     options = {key: entry for key, entry in value.items() if key not in OF_THE_PICTURE}
     sharp = options.get("filter_type") == "nearest"
-    return _Color(_repeated(picture) if sharp else picture, options, value.get("to_uv"))
+    return _repeated(picture) if sharp else picture, options, value.get("to_uv")
 
 
 def _repeated(picture: Floats) -> Floats:
@@ -403,13 +336,5 @@ def _pixels(value: Mapping[str, object]) -> Floats | None:
 
 def constant(value: object) -> Floats | None:
     """A colour (3,) that is the same everywhere; None of anything else."""
-    if isinstance(value, Mapping):
-        value = value.get("value") if value["type"] in ("rgb", "uniform", "spectrum", "srgb") else None
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        value = [float(value)] * 3
-    if not isinstance(value, (list, tuple, np.ndarray)) or np.shape(value) != (3,):
-        return None
-    try:
-        return np.array(value, dtype=np.float32)
-    except (TypeError, ValueError):  # pairs of wavelength and value
-        return None
+    numbers = _numbers(value)
+    return None if np.isnan(numbers).any() else np.broadcast_to(numbers, (3,)).astype(np.float32)

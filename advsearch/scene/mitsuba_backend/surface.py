@@ -22,33 +22,24 @@ from advsearch.scene.mitsuba_backend import texel_rays
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import Recordings, dr, mi, one_at_a_time
 
-SHARP, WIDE = 0.15, 0.4
-"""Spreads of gloss between which what one ray meets on the ground gives way to what surrounds the object."""
-CAMERA = 16
-"""Numbers of a camera."""
+SHARP, WIDE = 0.15, 0.4  # spreads of gloss between which one ray to the ground gives way to what surrounds the object
+CAMERA = 16  # numbers of a camera
 PATTERN = ((0.125, 0.375), (0.375, 0.875), (0.625, 0.125), (0.875, 0.625))
 """Where the rays of a pixel go through it: a turned grid, which sees upright and level edges at four places."""
 RAYS = len(PATTERN)
-LEAST = 1e-3
-"""Share of a ray's light under which what is behind a cut-out does not count."""
+LEAST = 1e-3  # share of a ray's light under which what is behind a cut-out does not count
 
 
 @dataclass(frozen=True, eq=False)
 class Lit:
-    """The light of one moment, as `Views` looks it up; flat arrays of Dr.Jit, three numbers each, and rows and columns
-    of the maps.
+    """The light of one moment, as `Views` looks it up: flat arrays, three numbers each, and sizes of the maps."""
 
-    Attributes:
-        texels: radiance that leaves each texel of all grids, and in the end that of the ground far off; of a
-            photographed ground, the share of the photograph that it shows.
-        sky: the environment's map, with the copied columns at both ends.
-        blurred: what surrounds the object, the ground too, blurred by each of `widths`.
-    """
-
+    # radiance that leaves each texel of all grids, and in the end that of the ground far off; of a photographed ground,
+    # the share of the photograph that it shows
     texels: Any
-    sky: Any
+    sky: Any  # the environment's map, with the copied columns at both ends
     sky_shape: tuple[int, int]
-    blurred: Any
+    blurred: Any  # what surrounds the object, the ground too, blurred by each of `widths`
     blurred_shape: tuple[int, int]
 
     @property
@@ -67,35 +58,25 @@ def lit_arrays(texels: Tensor, padded: Tensor, blurred: Tensor) -> Lit:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What cameras see.
+    """What cameras see."""
 
-    Attributes:
-        rest: (n, H, W, 3) radiance but for what the searched texture reflects diffusely.
-        covered: (n, H, W, 1) share of each pixel that shows surfaces.
-        sample: (k,) int64, the rays that see the searched texture, ascending; `RAYS` a pixel, row by row. One that goes
-            through cut-outs sees it several times.
-        uv, weight, back: where, (k, 2) as Mitsuba has them; (k,) the diffuse share over pi, and over the rays of a
-            pixel; and (k,) whether it is seen from behind.
-    """
-
-    rest: Tensor
-    covered: Tensor
+    rest: Tensor  # (n, H, W, 3) radiance but for what the searched texture reflects diffusely
+    covered: Tensor  # (n, H, W, 1) share of each pixel that shows surfaces
+    # (k,) int64, the rays that see the searched texture, ascending; `RAYS` a pixel, row by row. One that goes through
+    # cut-outs sees it several times
     sample: Tensor
-    uv: Tensor
-    weight: Tensor
-    back: Tensor
+    uv: Tensor  # (k, 2) where, as Mitsuba has them
+    weight: Tensor  # (k,) the diffuse share over pi, and over the rays of a pixel
+    back: Tensor  # (k,) whether it is seen from behind
 
 
 class Views:
-    """Looks through many cameras in one launch, which is recorded.
+    """Looks through many cameras of a scene in one launch, which is recorded; the inputs that it is asked with have to
+    be set in the scene.
 
-    Args:
-        scene: whose cameras and shapes these are; the inputs that it is asked with have to be set in it.
-        grids, lobes: of all surfaces that take part, those of the searched texture first.
-        widths: root mean square angles of the blurred maps, each twice the one before, radians.
-        photographed: height of the camera of a photographed ground; None where the ground is none.
-        model: the lens of all cameras; None for pinholes, which each have a field of view of their own.
-        middle: (3,) of the object, from which the blurred maps are seen.
+    Grids and lobes are those of all surfaces that take part, the searched texture's first. `widths` are the root mean
+    square angles, radians, of maps blurred as seen from the middle (3,) of the object, each twice the one before. A
+    ground is photographed from a height. A lens model is that of all cameras; pinholes each have a field of view.
     """
 
     def __init__(
@@ -244,7 +225,6 @@ class Views:
         return radiance
 
     def _texel(self, si: Any, on: Sequence[Any], lit: Lit) -> Any:
-        """What the texels say of what was hit; 0 where it has none."""
         first, rows, columns = mi.UInt32(0), mi.UInt32(1), mi.UInt32(1)
         y, x, known = mi.Float(0.0), mi.Float(0.0), mi.Bool(False)
         for grid, at in zip(self._grids, on, strict=True):
@@ -255,9 +235,6 @@ class Views:
             columns = dr.select(at, mi.UInt32(grid.shape[1]), columns)
         radiance = _bilinear(lit.texels, first, rows, columns, y * mi.Float(rows) - 0.5, x * mi.Float(columns) - 0.5)
         return dr.select(known, radiance, 0.0)
-
-
-# ---- look-ups -------------------------------------------------------------------------------------------------------
 
 
 def _camera(inputs: Mapping[str, Tensor], height: int, width: int) -> Floats:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -22,33 +22,24 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import dr, mi, one_at_a_time
 
 Ints = npt.NDArray[np.int32]
-
-SHIFT = 1e-4
-"""How far from a surface rays begin, object sizes."""
-PASS = 1 << 20
-"""Rays of one launch of `gather`."""
-LAYERS = 4
-"""Cut-outs that a ray goes through; what comes after them is taken for opaque."""
-FROM_BEHIND = 0.02
-"""Share of what is seen of a shape from outside, from which on the backs of its faces count."""
+Grids: TypeAlias = "Sequence[TexelGrid]"
+SHIFT = 1e-4  # how far from a surface rays begin, object sizes
+PASS = 1 << 20  # rays of one launch of `gather`
+LAYERS = 4  # cut-outs that a ray goes through; what comes after them is taken for opaque
+FROM_BEHIND = 0.02  # share of what is seen of a shape from outside, from which on the backs of its faces count
 
 
 @dataclass(frozen=True)
 class TexelGrid:
-    """The texels over one surface, of a shape in Mitsuba's scene; `first` is their first number among all grids.
-
-    Attributes:
-        shape: rows and columns.
-        warp: None where it lies over texture coordinates; else (middle x, middle y, scale, rate) of a level plane whose
-            cells are small about its middle: coordinate = middle + scale sinh(rate s), s in [-1, 1].
-        side: of the faces that it lies on: 1 the front, -1 the back, 0 both.
-    """
+    """The texels over one surface, of a shape in Mitsuba's scene; `first` is their first number among all grids."""
 
     name: str
     first: int
-    shape: tuple[int, int]
+    shape: tuple[int, int]  # rows and columns
+    # None where it lies over texture coordinates; else (middle x, middle y, scale, rate) of a level plane whose cells
+    # are small about its middle: coordinate = middle + scale sinh(rate s), s in [-1, 1]
     warp: tuple[float, float, float, float] | None = None
-    side: int = 0
+    side: int = 0  # of the faces that it lies on: 1 the front, -1 the back, 0 both
 
     @property
     def count(self) -> int:
@@ -56,24 +47,14 @@ class TexelGrid:
 
 
 def gather(
-    scene: MitsubaScene,
-    grids: Sequence[TexelGrid],
-    cells: tuple[int, int],
-    places: Floats,
-    normals: Floats,
-    rays: int,
-    seed: int,
+    scene: MitsubaScene, grids: Grids, cells: tuple[int, int], places: Floats, normals: Floats, rays: int, seed: int
 ) -> Ints:
-    """Return what rays from texels see, over the cosine: (n, rays) numbers of texels; from the count of all texels on,
-    of cells of the environment; or -1, where there is no light: the back of a surface that has texels, or a shape that
-    has none.
+    """Return what rays from texels of all grids in a scene with its inputs set see, over the cosine, as numbers (n,
+    rays) of texels; from the count of all texels on, of cells of the environment, which has so many rows and columns;
+    or -1, where there is no light: the back of a surface that has texels, or a shape that has none.
 
-    Args:
-        scene: with its inputs set.
-        grids: of all surfaces.
-        cells: rows and columns of the cells of the environment.
-        places, normals: (n, 3) where texels lie, and unit shading normals.
-        rays: of each texel; the same well-spread points for all, shifted by chance, of which `seed` is the number.
+    The texels lie at places (n, 3) with unit shading normals. All have the same well-spread points, shifted by chance,
+    of which `seed` is the number.
     """
     held, to_local, layers = scene._scene, to_map(scene), layers_of(scene)
     count, texels = len(places), grids[-1].first + grids[-1].count
@@ -117,16 +98,20 @@ def towards(scene: MitsubaScene, places: Floats, normals: Floats, ways: Floats) 
     place, normal = _points(mi.Point3f, places, texel), _points(mi.Normal3f, normals, texel)
     way = _points(mi.Vector3f, world, number)
     cosine = dr.dot(normal, way)
-    above = cosine > 0.0
-    ray = mi.Ray3f(place + normal * SHIFT, way)
-    received = dr.select(above, cosine * _passing(scene._scene, ray, layers_of(scene), above), 0.0)
-    cosines: Floats = received.numpy().reshape(len(places), len(world))
-    return cosines
+    active = above = cosine > 0.0
+    ray, share = mi.Ray3f(place + normal * SHIFT, way), mi.Float(1.0)
+    for _ in range(layers_of(scene)):  # cut-outs in the way
+        si = scene._scene.ray_intersect(ray, mi.RayFlags.UV, False, active)
+        active = active & si.is_valid()
+        share = dr.select(active, share * passed(si, active), share)
+        active = active & (share > 0.0)
+        ray = si.spawn_ray(ray.d)
+    share = dr.select(scene._scene.ray_test(ray, active), 0.0, share)
+    return np.asarray(dr.select(above, cosine * share, 0.0).numpy().reshape(len(places), len(world)))
 
 
 def seen_from_behind(scene: MitsubaScene, name: str, places: Floats) -> bool:
-    """Whether backs of the faces of a shape, with places (n, 3) on it, are seen from outside, as through an open
-    window."""
+    """Whether backs of the faces of a shape, with places (n, 3) on it, are seen from outside, as through a window."""
     generator = np.random.default_rng(0)
     ways = generator.standard_normal((PASS >> 7, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -140,9 +125,6 @@ def seen_from_behind(scene: MitsubaScene, name: str, places: Floats) -> bool:
     (on,) = on_grids(scene._scene, [TexelGrid(name, 0, (1, 1))], si, way)
     behind = np.asarray((on & (dr.dot(si.n, way) > 0.0)).numpy())
     return bool(behind.sum() > FROM_BEHIND * np.asarray(on.numpy()).sum())
-
-
-# ---- cut-outs -------------------------------------------------------------------------------------------------------
 
 
 def layers_of(scene: MitsubaScene) -> int:
@@ -168,27 +150,11 @@ def passed(si: Any, active: Any) -> Any:
     return dr.mean(si.bsdf().eval_null_transmission(si, active & si.is_valid()))
 
 
-def _passing(held: Any, ray: Any, layers: int, active: Any) -> Any:
-    """The share of light that passes all that is in the way of rays."""
-    share = mi.Float(1.0)
-    for _ in range(layers):
-        si = held.ray_intersect(ray, mi.RayFlags.UV, False, active)
-        active = active & si.is_valid()
-        share = dr.select(active, share * passed(si, active), share)
-        active = active & (share > 0.0)
-        ray = si.spawn_ray(ray.d)
-    return dr.select(held.ray_test(ray, active), 0.0, share)
-
-
 def _chance(layers: int, count: int, seed: tuple[int, ...]) -> Any:
-    """A number in [0, 1] for each ray."""
     return mi.Float(np.random.default_rng([*seed, 1]).random(count, dtype=np.float32)) if layers else 0.5
 
 
-# ---- places ---------------------------------------------------------------------------------------------------------
-
-
-def on_grids(held: Any, grids: Sequence[TexelGrid], si: Any, way: Any) -> list[Any]:
+def on_grids(held: Any, grids: Grids, si: Any, way: Any) -> list[Any]:
     """Whether hits of rays in a direction lie on each grid."""
     front, shapes = dr.dot(si.n, way) < 0.0, {shape.id(): shape for shape in held.shapes()}
     sides = {0: True, 1: front, -1: ~front}
@@ -230,31 +196,21 @@ def _points(kind: Any, values: Floats | Doubles, index: Any = None) -> Any:
     return points if index is None else dr.gather(kind, points, index)
 
 
-ANGLES = 32
-"""Entries of a table over the cosine of the angle of view."""
+ANGLES = 32  # entries of a table over the cosine of the angle of view
 LOBE_SAMPLES = 4096
-TABLES = ("diffuse", "gloss", "up", "along", "core", "tail")
-"""The tables of `Lobes`, in their order."""
+TABLES = ("diffuse", "gloss", "up", "along", "core", "tail")  # the tables of `Lobes`, in their order
 
 
 @dataclass(frozen=True, eq=False)
 class Lobes:
-    """What a surface does to light, by the cosine of the angle of view (`ANGLES` entries, the first at grazing).
+    """What a surface does to light, by the cosine of the angle of view (`ANGLES` entries, the first at grazing)."""
 
-    Attributes:
-        diffuse: (k,) share of even light that it reflects for a base colour of one, without the gloss.
-        gloss: (k,) share of even light that it reflects whatever the base colour.
-        up, along: (k,) of the gloss's mean direction: its parts along the normal, and away from the viewer.
-        core, tail: (k,) root mean square angle about that direction, radians, of the half of the gloss that is nearest
-            to it and of the other half: a lobe has longer tails than a normal distribution.
-    """
-
-    diffuse: Floats
-    gloss: Floats
-    up: Floats
-    along: Floats
-    core: Floats
-    tail: Floats
+    diffuse: Floats  # (k,) share of even light that it reflects for a base colour of one, without the gloss
+    gloss: Floats  # (k,) share of even light that it reflects whatever the base colour
+    up: Floats  # (k,) of the gloss's mean direction: its part along the normal
+    along: Floats  # (k,) and its part away from the viewer
+    core: Floats  # (k,) root mean square angle about that direction, radians, of the nearer half of the gloss
+    tail: Floats  # (k,) and of the other half: a lobe has longer tails than a normal distribution
 
     @classmethod
     def matt(cls) -> Lobes:
@@ -324,5 +280,4 @@ def _spreads(weight: Doubles, apart: Doubles) -> tuple[Doubles, Doubles]:
 
 
 def _rows(values: npt.NDArray[Any]) -> Doubles:
-    """Of each angle its samples."""
     return np.asarray(values, dtype=np.float64).reshape(ANGLES, LOBE_SAMPLES)

@@ -26,27 +26,18 @@ from torch import Tensor
 from advsearch.scene.mitsuba_backend.variant import dr, mi
 from advsearch.scene.surfaces import Surfaces
 
-STEP = 0.0625
-"""How much the base colour is changed for the derivative of a BSDF with respect to it."""
-ROUNDING = 1e-4
-"""Relative change of a BSDF under which it counts as none."""
+STEP = 0.0625  # how much the base colour is changed for the derivative of a BSDF with respect to it
+ROUNDING = 1e-4  # relative change of a BSDF under which it counts as none
 
 
 @dataclass(frozen=True, eq=False)
 class Vertices:
-    """Vertices of light paths, those with the same place in their path.
+    """Vertices of light paths, those with the same place in their path."""
 
-    Attributes:
-        pixel: (n,) int64, row by row.
-        uv: (n, 2) float32 texture coordinates as Mitsuba has them: row 0 of a base colour lies at v = 0.
-        weight: (n, 3) float32, divided by the samples a pixel, so that a pixel's sum is what counts.
-        sharp: (n,) bool: the camera sees it directly, or through mirrors and glass.
-    """
-
-    pixel: Tensor
-    uv: Tensor
-    weight: Tensor
-    sharp: Tensor
+    pixel: Tensor  # (n,) int64, row by row
+    uv: Tensor  # (n, 2) float32 texture coordinates as Mitsuba has them: row 0 of a base colour lies at v = 0
+    weight: Tensor  # (n, 3) float32, divided by the samples a pixel, so that a pixel's sum is what counts
+    sharp: Tensor  # (n,) bool: the camera sees it directly, or through mirrors and glass
 
     def only(self, mask: Tensor) -> Vertices:
         """Return those that a mask (n,) has."""
@@ -57,53 +48,29 @@ class Vertices:
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """What the paths of one picture say.
+    """What the paths of one picture say."""
 
-    Attributes:
-        radiance: (H, W, 3) float32, with the same noise as the weights; the environment is in it.
-        coverage: (H, W, 1), the share of each pixel that shows surfaces.
-        background: (H, W, 3), what of the radiance is the environment as the camera sees it.
-        albedo, normal: (H, W, 3), reflectance in [0, 1] and shading normal of the first hit that light does not pass.
-        vertices: by their place in the path.
-    """
-
-    radiance: Tensor
-    coverage: Tensor
-    background: Tensor
-    albedo: Tensor
-    normal: Tensor
-    vertices: list[Vertices]
+    radiance: Tensor  # (H, W, 3) float32, with the same noise as the weights; the environment is in it
+    coverage: Tensor  # (H, W, 1), the share of each pixel that shows surfaces
+    background: Tensor  # (H, W, 3), what of the radiance is the environment as the camera sees it
+    albedo: Tensor  # (H, W, 3), reflectance in [0, 1] of the first hit that light does not pass
+    normal: Tensor  # (H, W, 3), and its shading normal
+    vertices: list[Vertices]  # by their place in the path
 
 
 def mean_of(passes: Sequence[Paths]) -> Paths:
     """Return the mean pictures of passes with as many samples each; it has no vertices."""
-
-    def mean(name: str) -> Tensor:
-        return torch.stack([getattr(paths, name) for paths in passes]).mean(dim=0)
-
-    return Paths(mean("radiance"), mean("coverage"), mean("background"), mean("albedo"), mean("normal"), [])
+    names = ("radiance", "coverage", "background", "albedo", "normal")
+    means = [torch.stack([getattr(paths, name) for paths in passes]).mean(dim=0) for name in names]
+    return Paths(means[0], means[1], means[2], means[3], means[4], [])
 
 
 def collect(
-    scene: Any,
-    parameters: Any,
-    key: str,
-    noise: Any,
-    size: tuple[int, int],
-    depth: int,
-    spp: int,
-    projector: Any,
+    scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, int], depth: int, spp: int, projector: Any
 ) -> Paths:
-    """Trace one pass, of paths of at most `depth` segments. It is not recorded: Dr.Jit 1.5.0 crashes when it replays so
-    long a kernel.
-
-    Args:
-        scene, parameters: Mitsuba's, with its camera.
-        key: Mitsuba's name of the texture, (h, w, 3).
-        noise: the sampler, seeded, with `spp` samples a pixel.
-        size: height and width in pixels.
-        projector: the emitter whose picture the texture is; None where it is a base colour.
-    """
+    """Trace one pass, of paths of at most `depth` segments, of a picture of a size (height and width), with a sampler
+    that is seeded for `spp` samples a pixel; the texture (h, w, 3) with Mitsuba's key is a base colour, or the picture
+    of a projector. It is not recorded: Dr.Jit 1.5.0 crashes when it replays so long a kernel."""
     height, width = size
     sensor = scene.sensors()[0]
     pixel = dr.arange(mi.UInt32, height * width * spp) // spp
@@ -111,7 +78,7 @@ def collect(
     place = (corner + noise.next_2d()) / mi.Point2f(width, height)
     aperture = noise.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     ray, weight = sensor.sample_ray(0.0, 0.5, place, aperture)
-    first, emitted, bounces = _traced(scene, ray, weight, noise, depth)
+    first_hit, emitted, bounces = _traced(scene, ray, weight, noise, depth)
 
     # The same BSDFs once more, now that the base colour is larger by `STEP`: their differences are the derivatives. Or
     # the light of the projector alone, now that it throws white
@@ -142,84 +109,56 @@ def collect(
     L = dr.select(dr.isfinite(L), L, 0.0)
 
     every = dr.full(mi.Bool, True, height * width * spp)
-    channels = [*(L + emitted[0]), first.coverage, *first.background, *first.albedo, *first.normal]
+    channels = [*(L + emitted[0]), *first_hit]
     taking_part = [every & dr.any(weight != 0.0) & dr.all(dr.isfinite(weight)) for _, weight, _ in vertices]
     dr.eval(channels, vertices, taking_part)  # one kernel for the whole path
     means = [dr.block_sum(channel, spp) / spp for channel in channels]
     dr.eval(means)
     picture = torch.stack([mean.torch() for mean in means], dim=1).reshape(*size, -1)
     parts = [part.contiguous() for part in torch.split(picture, [3, 1, 3, 3, 3], dim=-1)]
-    kept = [_kept(*vertex, taken, spp) for vertex, taken in zip(vertices, taking_part, strict=True)]
+    kept = list[Vertices]()
+    for (uv, weight, sharp), taken in zip(vertices, taking_part, strict=True):
+        index: Any = dr.compress(taken)
+        if dr.width(index) == 0:
+            none = torch.zeros(0)
+            kept.append(Vertices(none.long(), none.reshape(0, 2), none.reshape(0, 3), none.bool()))
+            continue
+        uv, weight = dr.gather(mi.Point2f, uv, index), dr.gather(mi.Color3f, weight, index) / spp
+        pixel, sharp = index // spp, dr.gather(mi.Bool, sharp, index)
+        dr.eval(uv, weight, pixel, sharp)
+        places, weights = (torch.stack([axis.torch() for axis in axes], dim=1) for axes in (uv, weight))
+        kept.append(Vertices(pixel.torch().long(), places, weights, sharp.torch().bool()))
     return Paths(parts[0], parts[1], parts[2], parts[3], parts[4], kept)
-
-
-def _kept(uv: Any, weight: Any, sharp: Any, taking_part: Any, spp: int) -> Vertices:
-    """Take the vertices that take part out of all, as tensors."""
-    index: Any = dr.compress(taking_part)
-    if dr.width(index) == 0:
-        none = torch.zeros(0)
-        return Vertices(none.long(), none.reshape(0, 2), none.reshape(0, 3), none.bool())
-    uv, weight = dr.gather(mi.Point2f, uv, index), dr.gather(mi.Color3f, weight, index) / spp
-    pixel, sharp = index // spp, dr.gather(mi.Bool, sharp, index)
-    dr.eval(uv, weight, pixel, sharp)
-    places = torch.stack([uv.x.torch(), uv.y.torch()], dim=1)
-    return Vertices(
-        pixel.torch().long(), places, torch.stack([channel.torch() for channel in weight], dim=1), sharp.torch().bool()
-    )
-
-
-@dataclass
-class FirstHit:
-    """What the camera sees, by sample: the pictures of `Paths`."""
-
-    coverage: Any
-    background: Any
-    albedo: Any
-    normal: Any
-
-    def stops(self, si: Any, bsdf: Any, where: Any) -> None:
-        """Take reflectance and normal of a hit that light does not pass for those of the picture."""
-        self.albedo = dr.select(where, bsdf.eval_diffuse_reflectance(si, where), self.albedo)
-        self.normal = dr.select(where, si.sh_frame.n, self.normal)
 
 
 @dataclass(frozen=True)
 class Bounce:
-    """One vertex of all paths.
+    """One vertex of all paths."""
 
-    Attributes:
-        si, bsdf: surface interaction, and its BSDF.
-        throughput: of the path before it.
-        sharp: no vertex before it scatters light.
-        wo_em, active_em: direction to the light that was sampled, and in which lanes there is one.
-        em_weight: radiance from there over the density, with its weight beside BSDF sampling.
-        bsdf_sample, active_bsdf: the path's direction, and in which lanes it has a density.
-        bsdf_value_em, bsdf_value: the BSDF times the cosine for both directions.
-        bsdf_weight: the latter over its density: the throughput of the vertex.
-    """
-
-    si: Any
-    bsdf: Any
-    throughput: Any
-    sharp: Any
-    wo_em: Any
-    active_em: Any
-    em_weight: Any
-    bsdf_value_em: Any
-    bsdf_sample: Any
-    active_bsdf: Any
-    bsdf_value: Any
-    bsdf_weight: Any
+    si: Any  # surface interaction
+    bsdf: Any  # its BSDF
+    throughput: Any  # of the path before it
+    sharp: Any  # no vertex before it scatters light
+    wo_em: Any  # direction to the light that was sampled
+    active_em: Any  # in which lanes there is one
+    em_weight: Any  # radiance from there over the density, with its weight beside BSDF sampling
+    bsdf_value_em: Any  # the BSDF times the cosine for the direction to the light
+    bsdf_sample: Any  # the path's direction
+    active_bsdf: Any  # in which lanes it has a density
+    bsdf_weight: Any  # the same for the path's direction over its density: the throughput of the vertex
 
     def slopes(self) -> tuple[Any, Any]:
-        """The derivatives of both values by the base colour, which is larger by `STEP` now; the second over the
-        density."""
-        context = mi.BSDFContext()
-        value = self.bsdf.eval(context, self.si, self.wo_em, self.active_em)
-        slope_em = _slope(value, self.bsdf_value_em, self.active_em)
-        value = self.bsdf.eval(context, self.si, self.bsdf_sample.wo, self.active_bsdf)
-        slope = _slope(value, self.bsdf_value, self.active_bsdf)
-        return slope_em, slope / dr.select(self.active_bsdf, self.bsdf_sample.pdf, 1.0)
+        """The derivatives of both values by the base colour, larger by `STEP` now; the second over the density."""
+        bsdf_value = self.bsdf_weight * self.bsdf_sample.pdf
+        slopes = []
+        for wo, before, active in (
+            (self.wo_em, self.bsdf_value_em, self.active_em),
+            (self.bsdf_sample.wo, bsdf_value, self.active_bsdf),
+        ):
+            change = self.bsdf.eval(mi.BSDFContext(), self.si, wo, active) - before
+            changed = dr.max(dr.abs(change)) > ROUNDING * dr.max(dr.abs(before))  # not by rounding alone
+            slopes.append(dr.select(active & changed, change / STEP, 0.0))
+        return slopes[0], slopes[1] / dr.select(self.active_bsdf, self.bsdf_sample.pdf, 1.0)
 
     def lit_by(self, scene: Any, projector: Any) -> tuple[Any, Any]:
         """Where in its picture the vertex sees a projector, and what of that light leaves it along the path."""
@@ -231,15 +170,24 @@ class Bounce:
         return mi.Point2f(ds.uv), dr.select(seen, value * light, 0.0)
 
 
-def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[FirstHit, list[Any], list[Bounce]]:
-    """Trace paths; return what the camera sees, and from the first vertex on what each emits and, but for the last, how
+def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[list[Any], list[Any], list[Bounce]]:
+    """Trace paths; return what the camera sees, channel by
+    channel as in `Paths`, and from the first vertex on what each emits and, but for the last, how
     it reflects light. Rays of weight 0 see nothing."""
-    context, count = mi.BSDFContext(), dr.width(ray.o)
+    context, count, mis_weight = mi.BSDFContext(), dr.width(ray.o), mi.ad.integrators.common.mis_weight
     active = dr.any(weight > 0.0) & dr.full(mi.Bool, True, count)
     sharp = dr.full(mi.Bool, True, count)  # no vertex so far scatters light
     throughput = mi.Spectrum(1.0)
     cut_outs = any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf())
     straight = mi.Bool(cut_outs)  # the path has gone through cut-outs alone
+
+    albedo, normal = dr.zeros(mi.Color3f, count), dr.zeros(mi.Normal3f, count)
+
+    def stops(si: Any, bsdf: Any, where: Any) -> None:
+        """Take reflectance and normal of a hit that light does not pass for those of the picture."""
+        nonlocal albedo, normal
+        albedo = dr.select(where, bsdf.eval_diffuse_reflectance(si, where), albedo)
+        normal = dr.select(where, si.sh_frame.n, normal)
 
     # Of the vertex before: the camera counts as one that reflects in one direction alone
     prev_si, prev_pdf, prev_delta = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1.0), mi.Bool(True)
@@ -250,17 +198,16 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
         # ---- emission of what was hit: the vertex before may have sampled the same light, so the two share it
         ds = mi.DirectionSample3f(scene, si, prev_si)
         em_pdf = scene.pdf_emitter_direction(prev_si, ds, active & ~prev_delta)
-        mis = dr.select(prev_delta, 1.0, _mis_weight(prev_pdf, em_pdf))
+        mis = dr.select(prev_delta, 1.0, mis_weight(prev_pdf, em_pdf))
         emitted.append(dr.select(active, mis * si.emitter(scene, active).eval(si, active), 0.0))
 
         # ---- what the camera sees first; through cut-outs it sees what is behind them
         bsdf = si.bsdf(ray)
         if segment == 0:
-            covered, black = si.is_valid(), dr.zeros(mi.Color3f, count)
+            covered = si.is_valid()
             coverage, background = dr.select(covered, mi.Float(1.0), 0.0), dr.select(covered, 0.0, emitted[0])
-            first = FirstHit(coverage, background, albedo=black, normal=mi.Normal3f(black))
             if not cut_outs:
-                first.stops(si, bsdf, covered)
+                stops(si, bsdf, covered)
         active &= si.is_valid() & mi.Bool(segment + 1 < depth)
         if segment + 1 == depth:  # the last vertex takes light along, and reflects none
             break
@@ -270,7 +217,7 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
         active_em = active & (ds.pdf > 0.0)
         wo_em = si.to_local(ds.d)
         bsdf_value_em, bsdf_pdf_em = bsdf.eval_pdf(context, si, wo_em, active_em)
-        mis = dr.select(ds.delta, 1.0, _mis_weight(ds.pdf, bsdf_pdf_em))
+        mis = dr.select(ds.delta, 1.0, mis_weight(ds.pdf, bsdf_pdf_em))
         em_weight = dr.select(active_em, em_weight * mis, 0.0)
 
         # ---- the direction in which the path goes on
@@ -280,12 +227,11 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
         active_bsdf = active_next & ~delta  # a mirror's value has no derivative that could be evaluated
         if cut_outs:
             through = active_next & mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
-            first.stops(si, bsdf, straight & active & ~through)
+            stops(si, bsdf, straight & active & ~through)
             straight &= through
         bsdf_weight = dr.select(active_next, bsdf_weight, 0.0)
         light = wo_em, active_em, em_weight, bsdf_value_em
-        onward = bsdf_sample, active_bsdf, bsdf_weight * bsdf_sample.pdf, bsdf_weight
-        bounces.append(Bounce(si, bsdf, throughput, sharp, *light, *onward))
+        bounces.append(Bounce(si, bsdf, throughput, sharp, *light, bsdf_sample, active_bsdf, bsdf_weight))
 
         # ---- on to the next vertex
         throughput = throughput * bsdf_weight
@@ -293,19 +239,7 @@ def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[
         sharp = sharp & delta
         prev_si, prev_pdf, prev_delta = si, bsdf_sample.pdf, delta
         ray = si.spawn_ray(si.to_world(bsdf_sample.wo))
-    return first, emitted, bounces
-
-
-def _slope(after: Any, before: Any, active: Any) -> Any:
-    """The derivative of a BSDF from two values; zero where they differ by rounding alone, as on other surfaces."""
-    change = after - before
-    return dr.select(active & (dr.max(dr.abs(change)) > ROUNDING * dr.max(dr.abs(before))), change / STEP, 0.0)
-
-
-def _mis_weight(pdf_a: Any, pdf_b: Any) -> Any:
-    """The power heuristic's weight of a strategy with the first density beside one with the second."""
-    total = pdf_a * pdf_a + pdf_b * pdf_b
-    return dr.select(total > 0.0, pdf_a * pdf_a / total, 0.0)
+    return [coverage, *background, *albedo, *normal], emitted, bounces
 
 
 def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces:
@@ -327,8 +261,7 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
     active = dr.any(mi.Spectrum(weight) > 0.0) & dr.full(mi.Bool, True, count)
     number, face = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
     depth, z_depth = dr.full(mi.Float, dr.inf, count), dr.full(mi.Float, dr.inf, count)
-    normal, uv = dr.zeros(mi.Normal3f, count), dr.zeros(mi.Point2f, count)
-    shapes = scene.shapes()
+    normal, uv, shapes = dr.zeros(mi.Normal3f, count), dr.zeros(mi.Point2f, count), scene.shapes()
     while dr.any(active):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
@@ -355,11 +288,7 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
         return made
 
     return Surfaces(
-        names=tuple(shape.id() for shape in shapes),
-        id=picture(number).long(),
-        depth=picture(depth),
-        z_depth=picture(z_depth),
-        normal=torch.stack([picture(axis) for axis in normal], dim=-1),
-        uv=torch.stack([picture(axis) for axis in uv], dim=-1),
-        face=picture(face).long(),
-    )
+        names=tuple(shape.id() for shape in shapes), id=picture(number).long(), depth=picture(depth),
+        z_depth=picture(z_depth), normal=torch.stack([picture(axis) for axis in normal], dim=-1),
+        uv=torch.stack([picture(axis) for axis in uv], dim=-1), face=picture(face).long(),
+    )  # fmt: skip

@@ -4,7 +4,6 @@ scenes live inside it."""
 from __future__ import annotations
 
 import gc
-import itertools
 import sys
 import threading
 import weakref
@@ -17,11 +16,9 @@ from advsearch import threads
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 
 VARIANT = "llvm_ad_rgb"
-
 Plugin = dict[str, Any]
 """A plugin, or a whole scene, as Mitsuba's loader takes it: its `type`, and by Mitsuba's names for them numbers, texts,
 transforms, bitmaps, objects that are loaded already, and further plugins."""
-
 one_at_a_time = threading.RLock()
 """One thread renders, builds or denoises at a time: they share what Dr.Jit records, and the denoiser's pictures."""
 
@@ -126,40 +123,26 @@ class Population:
 
     def __init__(self) -> None:
         self.changes = 0
-        self._media: dict[int, tuple[Any, ...]] = {}
-        self._loose: list[Any] = []
-        self._held: dict[int, tuple[Any, ...]] = {}
+        self._held: dict[int, tuple[tuple[Any, ...], tuple[Any, ...]]] = {}
         self.unused: list[int] = []
 
     def add(self, owner: object, *objects: Any, media: tuple[Any, ...] = ()) -> None:
         """Hold Mitsuba's objects, with the media among them, for as long as their owner lives, and a little longer."""
         self.changes += 1
-        self._held[self.changes], self._media[self.changes] = objects, media
+        self._held[self.changes] = objects, media
         weakref.finalize(owner, self.unused.append, self.changes)
 
     def bury(self) -> None:
         """Let go of what has lost its owner, of which there is some. Call it between renders only."""
         while self.unused:
-            number = self.unused.pop()
-            self._held.pop(number, None), self._media.pop(number, None)
+            self._held.pop(self.unused.pop(), None)
         gc.collect()  # Mitsuba's Python objects form cycles; they have to go now, not during a later render
         self.changes += 1
-
-    def keep(self, medium: Any) -> None:
-        """Hold a medium that no shape refers to for good: Mitsuba does not let go of it, and `media` has to have it."""
-        self._loose.append(medium)
 
     def media(self) -> list[Any]:
         """Return the media of all scenes: what calls one of them is recorded with all that there are, and Dr.Jit 1.5.0
         finds no others than those of the scene that is rendered."""
-        return [*self._loose, *itertools.chain.from_iterable(self._media.values())]
+        return [medium for _, media in self._held.values() for medium in media]
 
 
-def media_in(scene: Any) -> tuple[Any, ...]:
-    """Return the media in the shapes of Mitsuba's scene."""
-    sides = [side for shape in scene.shapes() for side in (shape.interior_medium(), shape.exterior_medium())]
-    return tuple(medium for medium in sides if medium is not None)
-
-
-population = Population()
-"""Of this process."""
+population = Population()  # of this process

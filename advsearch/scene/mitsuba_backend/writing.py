@@ -32,14 +32,10 @@ from advsearch.scene.parts import PluginNumber
 from advsearch.scene.settings import CHANNELS
 
 NAME = "scene.xml"
-
 MATERIAL = ("roughness", "metallic", "specular", "clearcoat")
-SCATTERINGS = 3
-"""Segments that paths in haze have beyond those between surfaces: stock Mitsuba counts both alike."""
-ABSENT = ("to_world", *CAMERA_NUMBERS.values())
-"""Entries that a dictionary need not have for them to be set."""
-BAKED = ("filename", "to_world", "flip_tex_coords")
-"""Entries of a mesh from a file that are in the mesh that is written."""
+SCATTERINGS = 3  # segments that paths in haze have beyond those between surfaces: stock Mitsuba counts both alike
+ABSENT = ("to_world", *CAMERA_NUMBERS.values())  # entries that a dictionary need not have for them to be set
+BAKED = ("filename", "to_world", "flip_tex_coords")  # entries of a mesh from a file that are in what is written
 
 
 def write_scene(
@@ -96,8 +92,7 @@ def _put_haze(scene: Plugin, haze: parts.HazePart, left: Plugin) -> None:
 
 
 def _put(plugin: Plugin, key: list[str], value: Floats) -> bool:
-    """Set a number, colour, transform or picture by Mitsuba's name, where that is the way to it in a dictionary;
-    whether it is."""
+    """Set a number, colour, transform or picture by Mitsuba's name, where a dictionary has it; whether it does."""
     here, *rest = key
     if here.startswith("brdf_") and here not in plugin:  # the one surface of two sides
         here = next((name for name, inner in plugin.items() if isinstance(inner, Mapping)), here)
@@ -118,7 +113,6 @@ def _put(plugin: Plugin, key: list[str], value: Floats) -> bool:
 
 
 def _mesh(part: parts.MeshPart, left: Plugin) -> Plugin:
-    """A mesh's dictionary; takes its inputs from what is left."""
     inputs = {name.partition(".")[2]: left.pop(name) for name in list(left) if name.startswith(f"{part.name}.")}
     if "base_color" in inputs:
         part = replace(part, base_color=linear_to_srgb(torch.from_numpy(inputs.pop("base_color"))).numpy())
@@ -145,7 +139,6 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
     taken = set[Path]()
 
     def beside(name: str, suffix: str) -> Path:
-        """A file beside the scene that is not taken yet."""
         free = path.with_name(f"{path.stem}-{name}{suffix}")
         while free in taken:
             free = free.with_stem(f"{free.stem}-2")
@@ -194,14 +187,10 @@ def write_xml(path: Path, scene: Plugin, meshes: Mapping[str, Any], note: str) -
 
 # ---- The numbers and colours of a scene by Mitsuba's own names (the keys of `mitsuba.traverse`) ---------------------
 
-SMALL = (8, 8)
-"""Height and width of the picture of a scene that is only asked for its names."""
-BEHIND = ("differences",)
-"""Valid estimators of what Mitsuba has no derivative of."""
-STILL = ("adjoint", *BEHIND)
-"""Of what Mitsuba can differentiate and moves no outline."""
-UNSURE = (*BEHIND, "adjoint")
-"""Of what Mitsuba can differentiate, but for what changes at an outline or all at once."""
+SMALL = (8, 8)  # height and width of the picture of a scene that is only asked for its names
+BEHIND = ("differences",)  # valid estimators of what Mitsuba has no derivative of
+STILL = ("adjoint", *BEHIND)  # of what Mitsuba can differentiate and moves no outline
+UNSURE = (*BEHIND, "adjoint")  # of what Mitsuba can differentiate, but for what changes at an outline or all at once
 
 
 def plugin_numbers(description: SceneDescription, name: str, keys: tuple[str, ...]) -> tuple[PluginNumber, ...]:
@@ -229,8 +218,7 @@ def plugin_numbers(description: SceneDescription, name: str, keys: tuple[str, ..
 
 @lru_cache(maxsize=1)
 def _all(description: SceneDescription) -> tuple[dict[str, PluginNumber], dict[str, str]]:
-    """Every number and colour of a scene by its key, without inputs but for those that it has; and the type of the
-    rest."""
+    """Every number and colour of a scene by its key, with an input if it has one; and the type of the rest."""
     scene = MitsubaScene(description, SMALL)
     inputs = {key: name for name, (key, takes) in scene.declared.items() if takes.write in (number, color)}
     numbers: dict[str, PluginNumber] = {}

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -32,27 +32,22 @@ from advsearch.scene.mitsuba_backend.meshes import with_inner
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, fewer_warnings, mi
 
 SUFFIX = ".xml"
-
-LARGEST = 1 << 24
-"""Bytes of a file, and of all that it includes."""
+LARGEST = 1 << 24  # bytes of a file, and of all that it includes
 MOST_ELEMENTS = 50_000
 DEEPEST = 40
 MOST_INCLUDED = 50
-LONGEST = 10_000
-"""Letters of a text with the values of its `$names`."""
-TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}
-"""Elements that are not called as Mitsuba calls the type, in small letters."""
+LONGEST = 10_000  # letters of a text with the values of its `$names`
+TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}  # elements that are not called as the type is
 _PLACE = re.compile(r"^\[.*?\] Error while loading string \(line (\d+), col \d+\): ", re.DOTALL)
 
 
-def read_scene(path: Path, parameters: Mapping[str, str] | None = None) -> Plugin:
-    """Return the dictionary of a scene file: plugins with their `type`, numbers, texts, transforms (4, 4); some values
-    for its `$names` go over its own defaults.
+def read_scene(path: Path) -> Plugin:
+    """Return the dictionary of a scene file: plugins with their `type`, numbers, texts, transforms (4, 4).
 
     Raises:
         FileFormatError: it is missing, damaged, too large, or no Mitsuba scene.
     """
-    text = _Text(path, References(path), dict(parameters or {}))
+    text = _Text(path, References(path))
     root = text.parsed(read_bytes(path, "scene", (SUFFIX,)))
     if root.tag != "scene":
         raise damaged(path, "a Mitsuba scene, which begins with <scene version=...>", f"<{shown(root.tag)}>")
@@ -80,12 +75,11 @@ def read_scene(path: Path, parameters: Mapping[str, str] | None = None) -> Plugi
 class _Text:
     path: Path
     references: References
-    values: dict[str, str]
+    values: dict[str, str] = field(default_factory=dict)
     size: int = 0
     elements: int = 0
     included: int = 0
-    above: int = 0
-    """Lines before the scene's first one."""
+    above: int = 0  # lines before the scene's first one
 
     def parsed(self, data: bytes) -> ElementTree.Element:
         """Return the tree of a file, comments and blanks included, so that lines stay the same."""
@@ -147,7 +141,16 @@ class _Text:
                 self.fill(child)
                 inner.append(child)
                 continue
-            included = self.other(child.get("filename", ""))
+            self.included, name = self.included + 1, child.get("filename", "")
+            if self.included > MOST_INCLUDED:
+                raise FileFormatError(
+                    f"{self.path}: includes more than {MOST_INCLUDED} files; does one include itself?"
+                )
+            try:
+                included = self.parsed(self.references.get(name))
+            except FileNotFoundError:
+                reason = next(reversed(self.references.refused.values()))
+                raise FileFormatError(f"{self.path}: includes {shown(name)}, which {reason}") from None
             if included.tag != "scene":
                 alone, included = included, ElementTree.Element("scene")
                 included.append(alone)
@@ -155,19 +158,7 @@ class _Text:
             inner += list(included)
         element[:] = inner
 
-    def other(self, name: str) -> ElementTree.Element:
-        """Return the tree of a file that is included."""
-        self.included += 1
-        if self.included > MOST_INCLUDED:
-            raise FileFormatError(f"{self.path}: includes more than {MOST_INCLUDED} files; does one include itself?")
-        try:
-            return self.parsed(self.references.get(name))
-        except FileNotFoundError:
-            reason = next(reversed(self.references.refused.values()))
-            raise FileFormatError(f"{self.path}: includes {shown(name)}, which {reason}") from None
-
     def filled(self, text: str) -> str:
-        """Return a text with the values of its `$names`."""
         whole = ""
         for at, part in enumerate(re.split(r"\$(\w+)", text)):
             if at % 2 and part not in self.values:
@@ -181,14 +172,12 @@ class _Text:
 
 
 def _plugin(path: Path, state: Any, number: int, referred: set[str]) -> Plugin:
-    """Return a parsed plugin with all that is in it, as `mitsuba.load_dict` takes it; ids that it names are put into
-    `referred`."""
+    """Return a parsed plugin with all in it, as `mitsuba.load_dict` takes it; ids that it names go into `referred`."""
     kinds, props = mi.Properties.Type, state.nodes[number].props
     entries: Plugin = {"type": props.plugin_name()}
     last: dict[str, int] = {}
 
     def put(wanted: str, made: object) -> None:
-        """Under a name that is free: the one that is wanted, or with a number behind it."""
         name, count = wanted, last.get(wanted, 1)
         while name in entries:
             count += 1
@@ -242,19 +231,26 @@ def _plain(name: str) -> str:
     return name.replace(".", "_")
 
 
-STOCK = frozenset(
+SHAPES = frozenset(
+    "rectangle cube sphere cylinder disk obj ply serialized instance shapegroup sdfgrid bsplinecurve linearcurve "
+    "ellipsoids ellipsoidsmesh merge".split()
+)
+LIGHTS = frozenset("constant envmap point spot directional projector sunsky timed_sunsky area directionalarea".split())
+SENSORS = frozenset("perspective thinlens orthographic radiancemeter irradiancemeter distant batch".split())
+INTEGRATORS = frozenset(
+    "path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov ptracer depth moment stokes".split()
+)
+MEDIA = frozenset(("homogeneous", "heterogeneous"))
+OTHERS = frozenset(
     """
-    aov area batch bitmap blackbody blendbsdf blendphase box bsplinecurve bumpmap catmullrom checkerboard circular
-    conductor constant constvolume cube cylinder d65 depth dielectric diffuse direct directional directionalarea disk
-    distant ellipsoids ellipsoidsmesh envmap gaussian gridvolume hair hdrfilm heterogeneous hg homogeneous independent
-    instance irradiancemeter irregular isotropic lanczos ldsampler linearcurve mask mesh_attribute mitchell moment
-    multijitter normalmap null obj orthogonal orthographic path perspective plastic ply point polarizer pplastic prb
-    prb_basic prb_projective prbvolpath principled principledthin projector ptracer radiancemeter rawconstant rayleigh
-    rectangle ref regular retarder rgb roughconductor roughdielectric roughplastic scene sdfgrid serialized sggx
-    shapegroup specfilm spectrum sphere spot srgb stokes stratified sunsky tabphase tent thindielectric thinlens
-    timed_sunsky twosided uniform volpath volpathmis volume
+    bitmap blackbody blendbsdf blendphase box bumpmap catmullrom checkerboard circular conductor constvolume d65
+    dielectric diffuse gaussian gridvolume hair hdrfilm hg independent irregular isotropic lanczos ldsampler mask
+    mesh_attribute mitchell multijitter normalmap null orthogonal plastic polarizer pplastic principled principledthin
+    rawconstant rayleigh ref regular retarder rgb roughconductor roughdielectric roughplastic scene sggx specfilm
+    spectrum srgb stratified tabphase tent thindielectric twosided uniform volume
     """.split()
 )
+STOCK = (SHAPES | LIGHTS | SENSORS | INTEGRATORS | MEDIA | OTHERS) - {"merge"}
 """The plugins that come with Mitsuba 3.9, but for `measured` and `merge`."""
 
 

@@ -21,32 +21,24 @@ from advsearch.scene.places import paint
 from advsearch.scene.places.houses import Fronts
 from advsearch.scene.places.quads import DRY, FRONT, KERBS, ROAD, SHOWN, WET, Quads, Wall, shown
 
-END, CROSSING, FAR = 150.0, 12.0, 4000.0
-"""Where the street ends, how wide the one is that it meets, and how far the plain goes."""
+END, CROSSING, FAR = 150.0, 12.0, 4000.0  # where the street ends, how wide what it meets is, how far the plain goes
 KERB = 0.12
 TREES = (-118.0, -97.0, -76.0, -55.0, -34.0, -15.0, 22.0, 43.0, 64.0, 85.0, 106.0, 127.0)
 """x of the trees on the right; those on the left stand 9 m on."""
-POSTS = tuple(range(-135, 150, 30))
-"""x of the lamp posts, to the right and to the left in turn."""
-POST_AT, TREE_AT = (-3.05, 6.55), (-4.4, 7.9)
-"""y of the posts and of the trees, on the right and on the left."""
+POSTS = tuple(range(-135, 150, 30))  # x of the lamp posts, to the right and to the left in turn
+POST_AT, TREE_AT = (-3.05, 6.55), (-4.4, 7.9)  # y of the posts and of the trees, on the right and on the left
 LAMP_HEIGHT, ARM = 7.5, 1.7
-LAMP_SIZE = (0.36, 0.22)
-"""Of the area that shines, level."""
-
+LAMP_SIZE = (0.36, 0.22)  # of the area that shines, level
 WALL, PANE, LEAF, IRON = (
     Material(roughness=0.85, specular=0.25), Material(roughness=0.06, specular=0.6),
     Material(roughness=0.7, specular=0.25), Material(roughness=0.45, specular=0.5),
 )  # fmt: skip
 WET_WALL = Material(roughness=0.5, specular=0.4)
-
-
-LIT = {
+LIT = {  # luminance by night, cd/m2: a lamp puts 15 lux on the road below it (7.5 m, 0.36 x 0.22 m)
     "street-lamps": np.array((10650.0 * 1.16, 10650.0 * 0.98, 10650.0 * 0.73), np.float32),
     "lit-windows": np.array((36.0, 23.5, 10.0), np.float32),
     "shops": np.array((62.0, 48.0, 31.0), np.float32),
 }
-"""Luminance by night, cd/m2: a lamp puts 15 lux on the road below it (7.5 m, 0.36 x 0.22 m)."""
 
 
 class Tree(NamedTuple):
@@ -59,19 +51,13 @@ class Tree(NamedTuple):
 
 
 class StreetPlan(NamedTuple):
-    """What stands where.
+    """What stands where."""
 
-    Attributes:
-        ground: makes road and pavements.
-        fronts: of houses: walls, from where to where along them, seeds.
-        posts: (x, y) of the foot of each lamp post, and y of its lamp.
-        more: makes further meshes, from the metres of one object size.
-    """
-
-    ground: Callable[[], Quads]
-    fronts: tuple[tuple[Wall, float, float, int], ...]
+    ground: Callable[[], Quads]  # makes road and pavements
+    fronts: tuple[tuple[Wall, float, float, int], ...]  # of houses: walls, from where to where along them, seeds
     trees: tuple[Tree, ...]
-    posts: tuple[tuple[float, float, float], ...]
+    posts: tuple[tuple[float, float, float], ...]  # (x, y) of the foot of each lamp post, and y of its lamp
+    # makes further meshes, from the metres of one object size
     more: Callable[[float], tuple[MeshPart, ...]] = lambda metres: ()
 
 
@@ -94,9 +80,8 @@ def built(
     fallen, plain = Quads(), Quads()
     corners = FAR * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     plain.level((-FAR, FAR), (-FAR, FAR), -0.05, corners / 50.0)
-    walls, trees, posts = (
-        quads.swept(fallen) if snow else quads for quads in (rows.walls, _trees(plan.trees), _posts(plan.posts))
-    )
+    iron, lamps = _posts(plan.posts)
+    walls, trees, posts = (quads.swept(fallen) if snow else quads for quads in (rows.walls, _trees(plan.trees), iron))
     made = (
         (ROAD, plan.ground(), _display(paint.road, wet, snow), ground),
         ("houses", walls, _display(paint.walls), WET_WALL if wet else WALL),
@@ -105,18 +90,16 @@ def built(
         ("shops", rows.shops, _display(paint.panes), PANE),
         ("trees", trees, _leaves(), LEAF),
         ("posts", posts, grey, IRON),
-        ("street-lamps", _lamps(plan.posts), white, PANE),
+        ("street-lamps", lamps, white, PANE),
         ("plain", plain, white if snow else grass, WALL),
         *((("snow", fallen, white, WALL),) if snow else ()),
     )
     shine = {name: cd[None, None] / np.float32(candelas) for name, cd in LIT.items()} if dark and candelas else {}
-    return (
-        *(
-            MeshPart(name, quads.mesh(metres), base, finish, emission=shine.get(name), laid=True)
-            for name, quads, base, finish in made
-        ),
-        *plan.more(metres),
+    meshes = (
+        MeshPart(name, quads.mesh(metres), base, finish, emission=shine.get(name), laid=True)
+        for name, quads, base, finish in made
     )
+    return (*meshes, *plan.more(metres))
 
 
 @lru_cache(maxsize=8)
@@ -144,8 +127,7 @@ def _shown(*y: float) -> Doubles:
     return (np.array(y) - paint.FRONTS[0]) / (paint.FRONTS[1] - paint.FRONTS[0])
 
 
-ASPHALT = (2.4, 5.2)
-"""y between which the ground has no markings."""
+ASPHALT = (2.4, 5.2)  # y between which the ground has no markings
 
 
 def asphalt(quads: Quads, x: tuple[float, float], y: tuple[float, float]) -> None:
@@ -193,9 +175,6 @@ def _ground() -> Quads:
     street(quads, -END, END)
     closed(quads)
     return quads
-
-
-# ---- trees ----------------------------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=2)
@@ -248,14 +227,13 @@ def _tree(seed: int) -> Quads:
 
 
 def _leaves() -> Floats:
-    """Bark on the left, leaves of different greens to the right."""
     t = np.linspace(0.0, 1.0, 16, dtype=np.float32)[None, :, None]
     green = paint.tint((0.055, 0.105, 0.022)) * (1.0 - t) + paint.tint((0.13, 0.19, 0.04)) * t
     bark = paint.tint((0.085, 0.065, 0.048)) * (1.0 + 0.3 * t)
     return linear_to_srgb(np.concatenate([bark, green], axis=1).repeat(2, axis=0))
 
 
-def limb(quads: Quads, start: Doubles, end: Doubles, thick: float, thin: float, sides: int = 7, u: float = 0.2) -> None:
+def limb(quads: Quads, start: Doubles, end: Doubles, thick: float, thin: float, sides: int = 7) -> None:
     """A tapering round limb from one place to another."""
     ahead = (end - start) / np.linalg.norm(end - start)
     aside = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
@@ -266,11 +244,8 @@ def limb(quads: Quads, start: Doubles, end: Doubles, thick: float, thin: float, 
     low, high = start + thick * ring, end + thin * ring
     corners = np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
     normals = np.stack([ring[:-1], ring[1:], ring[1:], ring[:-1]], axis=1)
-    uvs = np.broadcast_to([u, 0.5], (sides, 4, 2)) + np.array([0.08, 0.0]) * np.arange(sides)[:, None, None] / sides
+    uvs = np.broadcast_to([0.2, 0.5], (sides, 4, 2)) + np.array([0.08, 0.0]) * np.arange(sides)[:, None, None] / sides
     quads.add(corners, uvs, normals)
-
-
-# ---- lamps ----------------------------------------------------------------------------------------------------------
 
 
 def lamp_places(posts: Sequence[tuple[float, float, float]]) -> Doubles:
@@ -278,8 +253,11 @@ def lamp_places(posts: Sequence[tuple[float, float, float]]) -> Doubles:
     return np.array([(x, lamp, KERB + LAMP_HEIGHT - 0.07) for x, _, lamp in posts])
 
 
-def _posts(posts: Sequence[tuple[float, float, float]]) -> Quads:
-    quads = Quads()
+def _posts(posts: Sequence[tuple[float, float, float]]) -> tuple[Quads, Quads]:
+    """The posts with their heads, and the areas that shine, facing down."""
+    quads, shining = Quads(), Quads()
+    half, wide = LAMP_SIZE[0] / 2 + 0.06, LAMP_SIZE[1] / 2 + 0.05
+    level = np.array([(-1, -1, 0), (-1, 1, 0), (1, 1, 0), (1, -1, 0)]) * [LAMP_SIZE[1] / 2.0, LAMP_SIZE[0] / 2.0, 0.0]
     for (x, y, z), (_, at, _) in zip(lamp_places(posts), posts, strict=True):
         foot = np.array([x, at, KERB])
         top = foot + np.array([0.0, 0.0, LAMP_HEIGHT])
@@ -287,27 +265,16 @@ def _posts(posts: Sequence[tuple[float, float, float]]) -> Quads:
         limb(quads, foot + np.array([0.0, 0.0, 1.0]), top, 0.07, 0.045, 10)
         limb(quads, top - [0.0, 0.0, 0.06], np.array([x, y, top[2] + 0.02]), 0.04, 0.03, 8)
         head = Wall((x, y, z), (0.0, -1.0 if at < y else 1.0, 0.0))
-        half, wide = LAMP_SIZE[0] / 2 + 0.06, LAMP_SIZE[1] / 2 + 0.05
-        box = np.array([[-wide, wide, -half - 0.1, half, 0.004, 0.12]])
-        quads.boxes(head, box, np.zeros((1, 4)), SHOWN)
+        quads.boxes(head, np.array([[-wide, wide, -half - 0.1, half, 0.004, 0.12]]), np.zeros((1, 4)), SHOWN)
         back = Wall((x, y, z), tuple(-np.array(head.out)))
         quads.boxes(back, np.array([[-wide, wide, 0.0, half + 0.1, 0.004, 0.12]]), np.zeros((1, 4)), (FRONT,))
-    return quads
+        shining.add(np.array([[(x, y, z)]]) + level, np.zeros((1, 4, 2)) + 0.5)
+    return quads, shining
 
 
-def _lamps(posts: Sequence[tuple[float, float, float]]) -> Quads:
-    """The areas that shine, facing down."""
-    quads, places = Quads(), lamp_places(posts)
-    half = np.array(LAMP_SIZE[::-1]) / 2.0
-    signs = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
-    corners = places[:, None] + np.concatenate([signs * half, np.zeros((4, 1))], axis=1)
-    quads.add(corners, np.zeros((len(places), 4, 2)) + 0.5)
-    return quads
-
-
-def trees_along(xs: Sequence[float] = TREES) -> tuple[Tree, ...]:
+def trees_along() -> tuple[Tree, ...]:
     """Return the trees on both sides of a street, those on the left 9 m on."""
-    return tuple(Tree(x + 9.0 * side, y, number, side) for side, y in enumerate(TREE_AT) for number, x in enumerate(xs))
+    return tuple(Tree(x + 9.0 * side, y, n, side) for side, y in enumerate(TREE_AT) for n, x in enumerate(TREES))
 
 
 def posts_along(xs: Sequence[float] = POSTS) -> tuple[tuple[float, float, float], ...]:
@@ -325,8 +292,7 @@ def ends() -> tuple[tuple[Wall, float, float, int], ...]:
     )
 
 
-RIGHT, LEFT = (
+RIGHT, LEFT = (  # walls on either side of a street along x; along the right one x falls
     Wall((0.0, paint.FRONTS[0], KERB), (0.0, 1.0, 0.0)), Wall((0.0, paint.FRONTS[1], KERB), (0.0, -1.0, 0.0)),
 )  # fmt: skip
-"""Walls on either side of a street along x; along the right one x falls."""
 AVENUE = StreetPlan(_ground, ((RIGHT, -END, END, 1), (LEFT, -END, END, 2), *ends()), trees_along(), posts_along())

@@ -18,20 +18,15 @@ from advsearch.scene.places.houses import DEPTH
 from advsearch.scene.places.paint import BAY, FRONTS
 from advsearch.scene.places.quads import FRONT, KERBS, TOP, Quads, Wall
 
-AHEAD = 14.0
-"""x of the middle of the other street, which is as wide."""
+AHEAD = 14.0  # x of the middle of the other street, which is as wide
 MIDDLE = sum(KERBS) / 2.0
-NEAR, FAR = AHEAD + MIDDLE - KERBS[1], AHEAD + MIDDLE - KERBS[0]
-"""x of its kerbs."""
-WEST, EAST = AHEAD + MIDDLE - FRONTS[1], AHEAD + MIDDLE - FRONTS[0]
-"""x of its fronts."""
+NEAR, FAR = AHEAD + MIDDLE - KERBS[1], AHEAD + MIDDLE - KERBS[0]  # x of its kerbs
+WEST, EAST = AHEAD + MIDDLE - FRONTS[1], AHEAD + MIDDLE - FRONTS[0]  # x of its fronts
 SIDE_END = 64.0
-STOP, ZEBRA = (3.6, 4.0), (4.9, 7.9)
-"""x of the stop line and of the zebra across the lane ahead."""
+STOP, ZEBRA = (3.6, 4.0), (4.9, 7.9)  # x of the stop line and of the zebra across the lane ahead
 STRIPE = 0.5
 SIGN = (4.4, -2.95)
-SIGN_LOW = 1.5
-"""Of the bundled stop sign's lower end over the pavement, on a post."""
+SIGN_LOW = 1.5  # of the bundled stop sign's lower end over the pavement, on a post
 
 
 def _ground() -> Quads:
@@ -91,11 +86,10 @@ def _fronts() -> tuple[tuple[Wall, float, float, int], ...]:
 
     long, west, east = row(END - EAST), row(END + WEST), row(SIDE_END - FRONTS[1] - DEPTH)
     (low, high), side = FRONTS, row(SIDE_END + FRONTS[0] - DEPTH)
-    right, left = Wall((0.0, low, KERB), (0.0, 1.0, 0.0)), Wall((0.0, high, KERB), (0.0, -1.0, 0.0))
     facing_east, facing_west = Wall((WEST, 0.0, KERB), (1.0, 0.0, 0.0)), Wall((EAST, 0.0, KERB), (-1.0, 0.0, 0.0))
     return (
-        (right, -WEST, -WEST + west, 1), (right, -EAST - long, -EAST, 6),
-        (left, WEST - west, WEST, 2), (left, EAST, EAST + long, 7),
+        (avenue.RIGHT, -WEST, -WEST + west, 1), (avenue.RIGHT, -EAST - long, -EAST, 6),
+        (avenue.LEFT, WEST - west, WEST, 2), (avenue.LEFT, EAST, EAST + long, 7),
         (facing_east, high + DEPTH, high + DEPTH + east, 8), (facing_east, low - DEPTH - side, low - DEPTH, 9),
         (facing_west, -high - DEPTH - east, -high - DEPTH, 10), (facing_west, DEPTH - low, DEPTH - low + side, 11),
         (Wall((AHEAD, SIDE_END - 2.0, KERB), (0.0, -1.0, 0.0)), -20.0, 20.0, 12),
@@ -105,7 +99,6 @@ def _fronts() -> tuple[tuple[Wall, float, float, int], ...]:
 
 
 def _clear(x: float) -> bool:
-    """Whether the place is beside the street, not in the crossing."""
     return not WEST - 1.0 < x < EAST + 1.0
 
 
@@ -126,10 +119,8 @@ CROSSING = StreetPlan(
 #
 # The object stands in a bay at the origin, with its front towards a lane.
 
-DEEP, WIDE, BAYS = 5.0, 2.5, 17
-"""Of a bay, and how many are beside each other."""
-ROWS = (-18.5, -7.5, -2.5, 8.5, 13.5, 24.5)
-"""Where rows begin in x: two back to back, then a lane, and so on."""
+DEEP, WIDE, BAYS = 5.0, 2.5, 17  # of a bay, and how many are beside each other
+ROWS = (-18.5, -7.5, -2.5, 8.5, 13.5, 24.5)  # where rows begin in x: two back to back, then a lane, and so on
 LINE = 0.1
 (BEGIN, CAR_PARK_END), HALF, WALK = (-20.0, 31.0), 24.0, 7.0
 """From and to in x, half of what it is in y, and how wide the pavement around it is."""

@@ -13,15 +13,11 @@ from advsearch.scene.assets import Doubles, Floats
 from advsearch.scene.places.quads import WETNESS, reflectance
 
 Color = tuple[float, float, float]
-
-PERIOD = 5.2
-"""Strips repeat along this: two bays of a front."""
+PERIOD = 5.2  # strips repeat along this: two bays of a front
 TEXEL = 0.025
 COLUMNS = round(PERIOD / TEXEL)
-
 BAY, GROUND_FLOOR, FLOOR = 2.6, 3.9, 3.1
-HIGHEST = 17.0
-"""Height of a strip of a front."""
+HIGHEST = 17.0  # height of a strip of a front
 WALLS: tuple[tuple[str, Color, Color], ...] = (
     ("bricks", (0.235, 0.085, 0.052), (0.40, 0.38, 0.33)), ("plaster", (0.55, 0.47, 0.33), (0.30, 0.28, 0.25)),
     ("stones", (0.46, 0.42, 0.34), (0.36, 0.33, 0.28)), ("plaster", (0.62, 0.58, 0.50), (0.42, 0.24, 0.17)),
@@ -29,11 +25,10 @@ WALLS: tuple[tuple[str, Color, Color], ...] = (
     ("stones", (0.36, 0.36, 0.34), (0.22, 0.23, 0.24)), ("plaster", (0.42, 0.46, 0.45), (0.50, 0.47, 0.42)),
 )  # fmt: skip
 """How the upper floors of each kind of front are laid, their linear reflectance, and that of the ground floor."""
-TRIMS: tuple[Color, ...] = (
+TRIMS: tuple[Color, ...] = (  # stone, white and dark paint, doors, chimneys, signs of shops: strips `TRIM` high
     (0.55, 0.52, 0.45), (0.66, 0.65, 0.61), (0.055, 0.06, 0.065), (0.10, 0.16, 0.11), (0.16, 0.055, 0.04),
     (0.06, 0.09, 0.15), (0.30, 0.28, 0.25), (0.45, 0.30, 0.10), (0.52, 0.10, 0.08), (0.05, 0.17, 0.20),
 )  # fmt: skip
-"""Stone, white and dark paint, doors, chimneys, and signs of shops: strips `TRIM` high."""
 TRIM, TILES = 0.6, 6.0
 STONE, WHITE, DARK, GREEN, RED, BLUE, GREY = range(7)
 HEIGHT = HIGHEST * len(WALLS) + TRIM * len(TRIMS) + TILES
@@ -57,7 +52,6 @@ def tile_rows(high: float) -> tuple[float, float]:
 
 
 def tint(color: Color | Doubles) -> Floats:
-    """Return three numbers as an array."""
     return np.asarray(color, np.float32)
 
 
@@ -113,10 +107,7 @@ def _courses(x: Floats, z: Floats, long: float, high: float, joint: float, seed:
     return edge, tone[course % 256, number]
 
 
-# ---- windows --------------------------------------------------------------------------------------------------------
-
-PANES = 8
-"""Kinds of panes, side by side: four of dwellings and four of shops."""
+PANES = 8  # kinds of panes, side by side: four of dwellings and four of shops
 
 
 @lru_cache(maxsize=1)
@@ -148,11 +139,8 @@ def panes() -> Floats:
     return np.concatenate(shown, axis=1)
 
 
-# ---- the road -------------------------------------------------------------------------------------------------------
-
 GROUND_PERIOD, GROUND_TEXEL = 24.0, 0.03
-FRONTS = (-12.0, 15.6)
-"""y of the fronts of the houses on the right and on the left."""
+FRONTS = (-12.0, 15.6)  # y of the fronts of the houses on the right and on the left
 
 
 @lru_cache(maxsize=3)
@@ -202,9 +190,6 @@ def _snowed(color: Floats, y: Floats, cloud: Floats, fine: Floats) -> Floats:
     slush = (0.5 + 0.16 * cloud + 0.08 * fine)[..., None] * tint((0.98, 0.98, 1.0))
     snow = clean + driven * (slush - clean)
     return np.asarray(snow + 0.85 * wheels[..., None] * (color - snow), np.float32)
-
-
-# ---- noise ----------------------------------------------------------------------------------------------------------
 
 
 def _places(rows: int, columns: int) -> tuple[Floats, Floats]:

@@ -13,10 +13,8 @@ from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
 
 FRONT, SIDES, TOP, BOTTOM = "front", "sides", "top", "bottom"
-SHOWN = (FRONT, SIDES, TOP, BOTTOM)
-"""Faces of a box that stands at a wall: all but its back."""
-SLOPE = 0.35
-"""Cosine between a surface that snow stays on and the level, at the least: 70 degrees."""
+SHOWN = (FRONT, SIDES, TOP, BOTTOM)  # faces of a box that stands at a wall: all but its back
+SLOPE = 0.35  # cosine between a surface that snow stays on and the level, at the least: 70 degrees
 
 
 @dataclass(frozen=True)
@@ -51,6 +49,10 @@ class Quads:
         self.uvs.append(np.broadcast_to(uvs, (*corners.shape[:2], 2)))
         self.normals.append(np.zeros_like(corners) if normals is None else normals)
 
+    def at(self, frame: Wall, along: Doubles, out: Doubles, up: Doubles, uvs: Doubles, turn: int = 1) -> None:
+        """Add quadrilaterals by a wall's coordinates (N, 4), in the other order where `turn` is -1; (N, 4, 2) uvs."""
+        self.add(frame.world(along, out, up)[:, ::turn], uvs[:, ::turn])
+
     def level(self, x: tuple[float, float], y: tuple[float, float], z: float, uvs: Doubles, up: int = 1) -> None:
         """Add a level rectangle, which faces up, or down where `up` is -1; texture coordinates (4, 2) of its corners,
         counter-clockwise from the least x and y."""
@@ -61,7 +63,7 @@ class Quads:
         """Add upright rectangles (N, 4) at a wall: left, right, low and high, so far out of it (N,), with texture
         coordinates (N, 4) of the same order."""
         along, up = np.moveaxis(_around(rows), -1, 0)
-        self.add(frame.world(along, np.reshape(out, (-1, 1)), up), _around(uvs))
+        self.at(frame, along, np.reshape(out, (-1, 1)), up, _around(uvs))
 
     def boxes(self, frame: Wall, rows: Doubles, uvs: Doubles, faces: Sequence[str] = SHOWN) -> None:
         """Add boxes (N, 6) at a wall: left, right, back, front, low, high, with texture coordinates (N, 4) as of `wall`
@@ -73,12 +75,12 @@ class Quads:
         along, out = np.moveaxis(_around(rows[:, [0, 1, 3, 2]]), -1, 0)
         for face, up, turn in ((TOP, high, 1), (BOTTOM, low, -1)):
             if face in faces:
-                self.add(frame.world(along, out, up[:, None])[:, ::turn], shown[:, ::turn])
+                self.at(frame, along, out, up[:, None], shown, turn)
         out, up = np.moveaxis(_around(rows[:, [3, 2, 4, 5]]), -1, 0)
         narrow = shown * [0.15, 1.0] + shown[:, :1] * [0.85, 0.0]
         for side, turn in ((left, -1), (right, 1)):
             if SIDES in faces:
-                self.add(frame.world(side[:, None], out, up)[:, ::turn], narrow[:, ::turn])
+                self.at(frame, side[:, None], out, up, narrow, turn)
 
     def swept(self, fallen: Quads) -> Quads:
         """Return those that do not face up, and add the others, which snow lies on, to `fallen`."""
@@ -119,20 +121,15 @@ def _around(uvs: Doubles) -> Doubles:
 # Lengths are metres. It runs along x; the object stands in the lane of those who drive towards +x, on the right. Beyond
 # the pavements, and far ahead, the environment's map is seen.
 
-ROAD = "road"
-"""Name of the mesh: asphalt with markings between two pavements, dry or wet."""
-FLOOR = "floor"
-"""Name of the mesh that things stand on in a room: its floor and the top of its table."""
+ROAD = "road"  # name of the mesh: asphalt with markings between two pavements, dry or wet
+FLOOR = "floor"  # name of the mesh that things stand on in a room: its floor and the top of its table
 LAID = (ROAD, FLOOR)
-KERBS = (-2.3, 5.8)
-"""Where the road ends on the right and on the left."""
-EDGES = (-10.0, 13.6)
-"""Where the pavements end: a multiple of their slabs."""
+KERBS = (-2.3, 5.8)  # where the road ends on the right and on the left
+EDGES = (-10.0, 13.6)  # where the pavements end: a multiple of their slabs
 EYE, FRONTS, STREET_ENDS = 1.5, (-12.0, 15.6), 170.0
 """Of the streets' maps: the height above the road that they are seen from, where the fronts of the houses stand on the
 right and on the left, and how far the street goes on."""
-PERIOD = 12.0
-"""The pattern repeats along the road."""
+PERIOD = 12.0  # the pattern repeats along the road
 LENGTH = 120.0
 TEXEL = 0.02
 DRY, WET = Material(roughness=0.9, specular=0.3), Material(roughness=0.16, specular=0.5)
@@ -141,8 +138,7 @@ WETNESS = 0.45
 
 
 def reflectance(x: Doubles, y: Doubles, grain: Doubles | None = None) -> Doubles:
-    """Return the linear reflectance (N, 3) of the ground at x along the road and y across it (N,); `grain` about 0 (N,)
-    is what makes asphalt uneven."""
+    """Return the linear reflectance (N, 3) of the ground at x along the road and y across; `grain` makes it uneven."""
     grain = np.zeros_like(x) if grain is None else grain
     wheels = np.exp(-(((np.abs(y) - 0.75) / 0.3) ** 2)) + np.exp(-(((np.abs(y - 3.5) - 0.75) / 0.3) ** 2))
     value = 0.085 * (1.0 - 0.12 * wheels) * (1.0 + grain)
@@ -161,8 +157,7 @@ def reflectance(x: Doubles, y: Doubles, grain: Doubles | None = None) -> Doubles
 
 @lru_cache(maxsize=4)
 def road(wet: bool, metres: float) -> MeshPart:
-    """Return the road, dark and reflecting where it is wet; `metres` are those of one object size, the scene's unit of
-    length."""
+    """Return the road, dark and reflecting where it is wet; `metres` are those of one object size."""
     corners = np.array([[-1.0, EDGES[0]], [1.0, EDGES[0]], [1.0, EDGES[1]], [-1.0, EDGES[1]]])
     places = corners * np.array([LENGTH / 2, 1.0])
     uvs = np.stack([places[:, 0] / PERIOD, (places[:, 1] - EDGES[0]) / (EDGES[1] - EDGES[0])], axis=1)
@@ -178,9 +173,14 @@ def road(wet: bool, metres: float) -> MeshPart:
 @lru_cache(maxsize=2)
 def _texture(wet: bool) -> Floats:
     """One period of the road, (h, w, 3) display-referred, multiples of 1/255, row 0 on the left."""
+    from scipy.ndimage import uniform_filter  # few scenes have this road
+
     width, height = round(PERIOD / TEXEL), round((EDGES[1] - EDGES[0]) / TEXEL)
     fine = np.random.Generator(np.random.PCG64(7)).random((height, width))
-    grain = 0.9 * (_blurred(fine, 1) - 0.5) + 0.8 * (_blurred(fine, 12) - 0.5)
+    grain = np.zeros_like(fine)
+    for share, side in ((0.9, 3), (0.8, 25)):  # means over squares of texels, stretched to the spread of one texel's
+        blurred = uniform_filter(fine, side, mode="wrap")
+        grain += share * 0.12 * (blurred - blurred.mean()) / blurred.std()
     x, y = np.meshgrid((np.arange(width) + 0.5) * TEXEL, EDGES[1] - (np.arange(height) + 0.5) * TEXEL)
     linear = reflectance(x.ravel(), y.ravel(), grain.ravel()).reshape(height, width, 3) * (WETNESS if wet else 1.0)
     return shown(np.round(linear, 5).astype(np.float32))
@@ -189,10 +189,3 @@ def _texture(wet: bool) -> Floats:
 def shown(linear: Floats) -> Floats:
     """Return linear values as display-referred multiples of 1/255."""
     return np.asarray(np.round(linear_to_srgb(linear) * np.float32(255.0)) / np.float32(255.0), np.float32)
-
-
-def _blurred(values: Doubles, reach: int) -> Doubles:
-    """Means over squares of 2 reach + 1 texels, periodic, stretched to the same spread as one texel's."""
-    for axis in (0, 1):
-        values = np.mean([np.roll(values, shift, axis) for shift in range(-reach, reach + 1)], axis=0)
-    return np.asarray((values - values.mean()) / values.std() * 0.12 + 0.5)

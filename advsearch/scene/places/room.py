@@ -16,31 +16,23 @@ from advsearch.scene.parts import MeshPart
 from advsearch.scene.places.paint import _clouds, _grain, tint
 from advsearch.scene.places.quads import FLOOR, FRONT, SHOWN, Quads, Wall, shown
 
-LOW, HIGH = (-1.75, -2.0, -0.75), (2.6, 1.9, 1.85)
-"""Corners of the room."""
-TABLE, THICK = ((-0.45, 0.45), (-0.8, 0.8)), 0.035
-"""From and to in x and y of its top, which is at height 0."""
+LOW, HIGH = (-1.75, -2.0, -0.75), (2.6, 1.9, 1.85)  # corners of the room
+TABLE, THICK = ((-0.45, 0.45), (-0.8, 0.8)), 0.035  # from and to in x and y of its top, which is at height 0
 CASE, BOARDS = ((-1.75, -1.46), (-1.5, 1.1)), (-0.69, -0.33, 0.03, 0.39, 0.75, 1.11)
 """From and to in x and y of the shelves at the wall, and the heights of their boards."""
-WINDOW = ((-0.9, 1.5), (0.12, 1.5))
-"""From and to in x and z, in the wall at the largest y."""
-REVEAL, LAMP = 0.16, 0.24
-"""How far the pane stands back, and half a side of the lamp."""
-DAY, NIGHT, SHADE = 2600.0, 0.6, 4200.0
-"""Luminance of the sky in the window by day and by night, and of the lamp, cd/m2."""
-USUAL = 1000.0
-"""Luminance of a radiance of 1, cd/m2, where the light has no unit."""
-
+WINDOW = ((-0.9, 1.5), (0.12, 1.5))  # from and to in x and z, in the wall at the largest y
+REVEAL, LAMP = 0.16, 0.24  # how far the pane stands back, and half a side of the lamp
+DAY, NIGHT, SHADE = 2600.0, 0.6, 4200.0  # luminance of the window's sky by day and by night, and of the lamp, cd/m2
+USUAL = 1000.0  # luminance of a radiance of 1, cd/m2, where the light has no unit
 STRIP, TEXEL, COLUMNS = 0.5, 0.0125, 96
 """How high each strip of the texture is, how large a texel, and how many there are along a strip of 1.2 m."""
 LONG = TEXEL * COLUMNS
 PLANKS, PLASTER, OAK, WHITE = range(4)
-COLORS = (
+COLORS = (  # linear reflectance; behind the first five, of books
     (0.20, 0.115, 0.062), (0.62, 0.58, 0.51), (0.34, 0.19, 0.095), (0.66, 0.65, 0.62), (0.09, 0.09, 0.09),
     (0.32, 0.05, 0.04), (0.05, 0.11, 0.24), (0.07, 0.17, 0.10), (0.42, 0.30, 0.09), (0.50, 0.46, 0.38),
     (0.10, 0.07, 0.05), (0.22, 0.26, 0.30), (0.36, 0.16, 0.07),
 )  # fmt: skip
-"""Linear reflectance; behind the first five, of books."""
 BOOKS = tuple(range(5, len(COLORS)))
 MATT, VARNISH = Material(roughness=0.8, specular=0.3), Material(roughness=0.35, specular=0.45)
 
@@ -112,7 +104,6 @@ def _rows(strip: int, low: Doubles | float, high: Doubles | float) -> tuple[Doub
 
 
 def _block(quads: Quads, x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], strip: int) -> None:
-    """Add a box with all its faces."""
     low, high = map(float, _rows(strip, *z))
     for out, row in ((-1.0, (*x, -y[1], -y[0], *z)), (1.0, (-x[1], -x[0], y[0], y[1], *z))):
         uvs = np.array([[row[0] / LONG, row[1] / LONG, low, high]])

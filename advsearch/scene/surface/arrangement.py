@@ -69,18 +69,13 @@ def product(matrix: scipy.sparse.csr_matrix, columns: Tensor) -> Tensor:
     return rows
 
 
-SIDE = 160
-"""Texels a side over the searched object."""
-GATHERED = 256
-"""Rays from each texel that say what it sees."""
-BURIED = 0.3
-"""Share of a texel's rays that meet the back of a surface from which on it lies inside of something."""
+SIDE = 160  # texels a side over the searched object
+GATHERED = 256  # rays from each texel that say what it sees
+BURIED = 0.3  # share of a texel's rays that meet the back of a surface from which on it lies inside of something
 BOUNCES = 4
 """How often light goes from texel to texel: that and the camera's and the sky's segments make a path of `MAX_DEPTH`."""
-FINE = 192
-"""Least side of the grid on which base colour and light are multiplied."""
-WHITE = 0.95
-"""Reflectance that a photographed ground has at most, where light goes from surface to surface."""
+FINE = 192  # least side of the grid on which base colour and light are multiplied
+WHITE = 0.95  # reflectance that a photographed ground has at most, where light goes from surface to surface
 COLOR, MAP, GROUND = f"{OBJECT}.base_color", "environment.padded", "ground"
 CAMERAS = frozenset({"camera.to_world", "camera.fov", "camera.shift_x", "camera.shift_y"})
 FREE = CAMERAS | ON_PICTURE | {MAP, COLOR, "ground.reflectance"}
@@ -97,7 +92,6 @@ class Light:
 
     @property
     def bytes(self) -> int:
-        """Memory."""
         return 4 * (self.on_object.numel() + self.lit.numbers)
 
     def reflected(self, fine: Tensor) -> Tensor:
@@ -200,7 +194,6 @@ class Arrangement:
 
     @property
     def bytes(self) -> int:
-        """Memory of all matrices."""
         return 8 * self.entries
 
     def look(self, cameras: Sequence[Mapping[str, Tensor]], light: Light) -> Callable[[], Seen]:
@@ -209,7 +202,6 @@ class Arrangement:
         return self._views(cameras, light.lit)
 
     def view(self, seen: Seen, number: int) -> SurfaceView:
-        """Return what one of several cameras sees."""
         return SurfaceView(seen, number, self.fine, self.sides)
 
     def finer(self, color: Tensor) -> Tensor:

@@ -20,10 +20,8 @@ from advsearch.scene.predictor import BETWEEN, MOST_BYTES, NOISE, Predictor, dif
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light, SurfaceView
 
-MOST_RAYS = 1 << 21
-"""Rays of cameras of one launch."""
-TEXELS = 333
-"""Of an environment's map, by which it is known again."""
+MOST_RAYS = 1 << 21  # rays of cameras of one launch
+TEXELS = 333  # of an environment's map, by which it is known again
 
 
 class Look(NamedTuple):
@@ -44,7 +42,6 @@ class Sketch:
 
     @classmethod
     def of(cls, padded: Tensor) -> Sketch:
-        """Sketch a map (H, W + 2, 3)."""
         flat, mean = padded.reshape(-1, 3), padded.reshape(-1, 3).mean(dim=0)
         return cls(mean, flat[:: max(1, len(flat) // TEXELS)] / mean.clamp_min(1e-12))
 
@@ -85,7 +82,6 @@ class SurfaceRenderer(Predictor):
             return self.traced.scene.assembly(self.traced.space.inputs(u))
 
     def color(self, inputs: Mapping[str, Tensor]) -> Tensor:
-        """Return the base colour (h, w, 3) of scene inputs."""
         return inputs.get(COLOR, self._base[COLOR])
 
     def stands(self, inputs: Mapping[str, Tensor]) -> bool:
@@ -107,7 +103,6 @@ class SurfaceRenderer(Predictor):
 
     @property
     def at_once(self) -> int:
-        """Cameras of one launch, at most."""
         height, width = self.traced.formation.resolution
         return max(1, MOST_RAYS // (height * width * RAYS))
 
@@ -122,7 +117,6 @@ class SurfaceRenderer(Predictor):
         return self.arrangement.bytes + sum(light.bytes for light in self.lights_kept.values())
 
     def light(self, inputs: Mapping[str, Tensor]) -> Light:
-        """Make the light under the environment of scene inputs."""
         return self.arrangement.light(inputs.get(MAP, self._base[MAP]).detach(), self.there)
 
     def kept_light(self, inputs: Mapping[str, Tensor]) -> tuple[Light, Tensor]:

@@ -27,16 +27,12 @@ from advsearch.scene.mitsuba_backend.texel_rays import TexelGrid
 from advsearch.scene.raster import BORDER, Charts, rasterised
 from advsearch.scene.transport.matrix import by_rows
 
-GROUND = 112
-"""Texels a side over the ground."""
-NEAR = 12.0
-"""Half the side of the ground that has texels, object sizes; further out there is the light of its border."""
+GROUND = 112  # texels a side over the ground
+NEAR = 12.0  # half the side of the ground that has texels, object sizes; further out there is the light of its border
 FINEST = 0.01
 """Side of the ground's texels under the middle of the object, object sizes: contact shadows are that sharp."""
-REACH = 2
-"""Texels to each side that the light of a place is taken from."""
-WIDTH = 0.8
-"""Standard deviation of the weight of these, texels."""
+REACH = 2  # texels to each side that the light of a place is taken from
+WIDTH = 0.8  # standard deviation of the weight of these, texels
 SAME = 1.5
 """Standard deviation of the weight of their distance in space, sides of a texel: those of another chart take no part,
 nor those of the other wall of a cup."""
@@ -56,12 +52,10 @@ class LitTexels:
     begin: tuple[int, ...]  # of each grid its first texel, and the number of all
 
     def of(self, number: int) -> slice:
-        """The texels of a grid."""
         return slice(self.begin[number], self.begin[number + 1])
 
 
 def together(some: Sequence[LitTexels]) -> LitTexels:
-    """Return the texels of several surfaces as one."""
     first = np.cumsum([0] + [len(each.places) for each in some])
     cells = np.cumsum([0] + [each.grids[0].count for each in some])
     return LitTexels(
@@ -159,21 +153,12 @@ def smoothed(ground: LitTexels, lit: Bools) -> Tensor:
     side = ground.grids[0].shape[0]
     inside = (lit if lit.any() else ~lit).reshape(side, side)
     source = _nearest(inside)
-    row, column = np.divmod(np.arange(side * side), side)
-    chosen, weights = [], []
-    for down, tall in zip(range(-2, 3), BINOMIAL, strict=True):
-        for across, wide in zip(range(-2, 3), BINOMIAL, strict=True):
-            y, x = row + down, column + across
-            there = (y >= 0) & (y < side) & (x >= 0) & (x < side)
-            at = y.clip(0, side - 1) * side + x.clip(0, side - 1)
-            chosen.append(at)
-            weights.append(tall * wide * (there & inside.ravel()[at]))
-    places, weight = np.stack(chosen, axis=1), np.stack(weights, axis=1).astype(np.float64)
-    weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
-    every = scipy.sparse.csr_matrix(
-        (weight.ravel().astype(np.float32), places.ravel(), np.arange(side * side + 1) * 25), (side * side, side * side)
+    band = scipy.sparse.diags_array(BINOMIAL, offsets=range(-2, 3), shape=(side, side), dtype=np.float64)
+    every = scipy.sparse.csr_array(
+        scipy.sparse.kron(band, band) @ scipy.sparse.diags_array(inside.ravel().astype(float))
     )
-    return by_rows(every[source])
+    every.data /= np.maximum(np.repeat(every.sum(axis=1), np.diff(every.indptr)), 1e-12)
+    return by_rows(every.astype(np.float32)[source])
 
 
 def _surface(charts: Charts, vertices: Floats, normals: Floats) -> tuple[Floats, Floats]:
@@ -194,21 +179,16 @@ def _nearest(covered: Bools) -> Ints:
     return nearest
 
 
-CELLS = (32, 64)
-"""Rows and columns of the cells of the environment."""
+CELLS = (32, 64)  # rows and columns of the cells of the environment
 WIDTHS = (math.radians(3.0), math.radians(6.0), math.radians(12.0), math.radians(24.0), math.radians(48.0))
 """By which the environment is blurred for gloss, radians."""
-BLURRED = (64, 128)
-"""Rows and columns of the blurred maps."""
-HOT = 8.0
-"""Multiples of the mean luminance above which light of the environment is found by rays of its own."""
-HOT_RAYS = 48
-"""Rays from each texel towards such light."""
+BLURRED = (64, 128)  # rows and columns of the blurred maps
+HOT = 8.0  # multiples of the mean luminance above which light of the environment is found by rays of its own
+HOT_RAYS = 48  # rays from each texel towards such light
 SPREAD = (7, 11)
 """Steps, down and across, of a lattice of so many points: 11 / 7 is 29 of 48, the golden ratio's neighbour, and both
 coordinates are even."""
-LITTLE = 0.02
-"""Share of the light up to which it is left to the cells."""
+LITTLE = 0.02  # share of the light up to which it is left to the cells
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
 
 
@@ -224,7 +204,6 @@ class SkyLight:
 
 
 def sky_of(padded: Tensor) -> SkyLight:
-    """Cut an environment (H, W + 2, 3) for look-ups."""
     radiance = padded[:, 1:-1].detach()
     rows, columns = radiance.shape[:2]
     polar = torch.linspace(0.0, math.pi, rows)

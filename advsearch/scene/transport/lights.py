@@ -26,24 +26,17 @@ from advsearch.scene.gradients import Group
 from advsearch.scene.parts import PATTERN, PluginPart
 from advsearch.scene.predictor import BETWEEN, NOISE, Predictor, differs
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.matrix import SPP, LinearRenderer, Tick, linear_inputs, passes
+from advsearch.scene.transport.matrix import SPP, Inputs, LinearRenderer, Tick, linear_inputs, passes, untold
 
 ENVIRONMENT = "environment.padded"
-LAMPS = (".intensity", ".radiance")
-"""What the names of inputs end in that are the light of a lamp, (3,)."""
-SAME = 1e-3
-"""Relative difference up to which a map is a multiple of another one: float32 after a tone curve and back."""
-PROBED = 64
-"""Options of a discrete choice that are looked at, at most."""
+LAMPS = (".intensity", ".radiance")  # what the names of inputs end in that are the light of a lamp, (3,)
+SAME = 1e-3  # relative difference up to which a map is a multiple of another one: float32 after a tone curve and back
+PROBED = 64  # options of a discrete choice that are looked at, at most
 TINY = 1e-30
-FEW = 4
-"""Every so many rows and columns of a map are looked at first."""
-
-Inputs = Mapping[str, Tensor]
+FEW = 4  # every so many rows and columns of a map are looked at first
 
 
 def light_inputs(renderer: Renderer) -> frozenset[str]:
-    """The inputs of a scene that are light."""
     return frozenset(name for name in renderer.scene.names if name == ENVIRONMENT or name.endswith(LAMPS))
 
 
@@ -67,7 +60,6 @@ class Lighting:
 
     @property
     def moved(self) -> frozenset[str]:
-        """The inputs that are light and move."""
         return frozenset[str]().union(*self.groups.values()) - ON_PICTURE
 
 
@@ -167,7 +159,6 @@ class Span:
         return weights
 
     def map(self, weights: Tensor) -> Tensor:
-        """Return the map (H, W, 3) of weights (k, 3)."""
         return torch.einsum("khwc,kc->hwc", self.maps, weights)
 
     @cached_property
@@ -235,13 +226,7 @@ class BasisRenderer(Predictor):
     """
 
     def __init__(
-        self,
-        traced: Renderer,
-        u: Tensor,
-        seed: int,
-        tick: Tick = lambda samples: None,
-        *,
-        moving: Lighting | None = None,
+        self, traced: Renderer, u: Tensor, seed: int, tick: Tick = untold, *, moving: Lighting | None = None
     ) -> None:
         super().__init__(traced)
         with torch.no_grad():
@@ -260,7 +245,6 @@ class BasisRenderer(Predictor):
 
     @property
     def lights(self) -> int:
-        """How many there are."""
         return len(self._of_each)
 
     @property
@@ -277,8 +261,7 @@ class BasisRenderer(Predictor):
         return torch.cat([radiance, pictures[0][..., 3:]], dim=-1)
 
 
-HAZE = "there is haze"
-"""A reason that stands alone: without haze, pictures of the same space could be predicted."""
+HAZE = "there is haze"  # A reason that stands alone: without haze, pictures of the same space could be predicted
 
 
 def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
@@ -306,7 +289,7 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     return None if renderer.formation.denoiser == "oidn" else NOISE
 
 
-def predicting(renderer: Renderer, u: Tensor, seed: int, tick: Tick = lambda samples: None) -> Predictor:
+def predicting(renderer: Renderer, u: Tensor, seed: int, tick: Tick = untold) -> Predictor:
     """Return what predicts the pictures of a renderer's space, made at u; arguments as for `LinearRenderer`."""
     moving = lighting(renderer)
     if moving.moved:

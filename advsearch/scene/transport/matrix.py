@@ -36,12 +36,9 @@ from advsearch.scene.parts import PATTERN
 from advsearch.scene.predictor import MOST_BYTES, LinearMap, Predictor
 from advsearch.scene.renderer import InputSpace, Renderer
 
-Smooth = Callable[[Tensor], Tensor]
-"""From a noisy picture (H, W, 3) to one without noise."""
-MOST_MEANS = 6e4
-"""Multiples of its mean up to which a picture is kept; any exposure has clipped them long before."""
-COARSE = 8
-"""Side of the cells of later vertices, in texels."""
+Smooth = Callable[[Tensor], Tensor]  # from a noisy picture (H, W, 3) to one without noise
+MOST_MEANS = 6e4  # multiples of its mean up to which a picture is kept; any exposure has clipped them long before
+COARSE = 8  # side of the cells of later vertices, in texels
 
 
 class Halves:
@@ -55,7 +52,6 @@ class Halves:
         self._unpacked = None if small else self._values.float() * self._scale
 
     def __call__(self) -> Tensor:
-        """The picture, float32."""
         return self._values.float() * self._scale if self._unpacked is None else self._unpacked
 
 
@@ -116,7 +112,6 @@ class ColouredRows:
         return product.mul_(self._kept_colours().reshape(-1, 3))
 
     def transposed_times(self, values: Tensor) -> Tensor:
-        """Return the transpose times (rows, 3): (columns, 3)."""
         coloured = values * self._kept_colours().reshape(-1, 3)
         ours = self._both_ways
         return ours[1] @ coloured if ours else torch.from_numpy(self._shares().T @ coloured.numpy())
@@ -208,7 +203,6 @@ def bilinear(uv: Floats, texture: tuple[int, int]) -> tuple[npt.NDArray[np.int32
     their places in the flat texture; and their shares (n, 4)."""
 
     def both(at: Floats, count: int) -> tuple[list[npt.NDArray[np.int32]], list[Floats]]:
-        """The texels on either side, along one axis, and their shares."""
         first, share = np.floor(at).astype(np.int32), (at - np.floor(at)).astype(np.float32)
         return [first % count, (first + 1) % count], [1.0 - share, share]
 
@@ -221,16 +215,19 @@ def bilinear(uv: Floats, texture: tuple[int, int]) -> tuple[npt.NDArray[np.int32
 SPP = 128
 """Samples a pixel of the paths whose vertices become the matrix and which make the base picture; what noise the
 denoiser leaves in it is in all predicted pictures."""
-PASS = 2**20
-"""Samples of all pixels in one pass; its vertices are held in memory."""
-MOST = 4.0
-"""Factor by which the noise of the base picture corrects a row at most."""
+PASS = 2**20  # samples of all pixels in one pass; its vertices are held in memory
+MOST = 4.0  # factor by which the noise of the base picture corrects a row at most
 TOO_LARGE = "the matrix would take more than"
 LINEAR = (".base_color", PATTERN)
 """What the names of inputs end in to which radiance is linear, but for light that meets a base colour twice."""
 
-Tick = Callable[[int], None]
-"""Told of samples a pixel as they are traced."""
+Inputs = Mapping[str, Tensor]
+SomeNames = Collection[str] | None
+Tick = Callable[[int], None]  # told of samples a pixel as they are traced
+
+
+def untold(samples: int) -> None:
+    """Tell nobody."""
 
 
 class TransportTooLargeError(Exception):
@@ -243,7 +240,7 @@ class Linearised:
 
     transports: Mapping[str, TextureTransport]  # by input, finished
     there: dict[str, Tensor]  # the inputs where it was linearised
-    applied: Mapping[str, Tensor]  # those that belong to the picture, not to the scene
+    applied: Inputs  # those that belong to the picture, not to the scene
     base: Halves  # the picture there, linear radiance, and coverage where there is a backdrop
     non_finite: int = 0
 
@@ -261,12 +258,12 @@ class LinearRenderer(Predictor):
         traced: Renderer,
         u: Tensor,
         seed: int,
-        tick: Tick = lambda samples: None,
+        tick: Tick = untold,
         *,
         spp: int = SPP,
         quick: bool = False,
-        names: Collection[str] | None = None,
-        light: Mapping[str, Tensor] = MappingProxyType({}),
+        names: SomeNames = None,
+        light: Inputs = MappingProxyType({}),
         collected: Linearised | None = None,
     ) -> None:
         super().__init__(traced)
@@ -290,28 +287,21 @@ class LinearRenderer(Predictor):
         del self.traced.scene
         self.traced.space = space
 
-    def radiance(self, inputs: Mapping[str, Tensor]) -> Tensor:
+    def radiance(self, inputs: Inputs) -> Tensor:
         base = self.collected.base()
         radiance = base[..., :3]
         for name, transport in self.collected.transports.items():
             radiance = radiance + transport(inputs[name] - self.there[name])
         return radiance if base.shape[-1] == 3 else torch.cat([radiance, base[..., 3:]], dim=-1)
 
-    def shown(self, inputs: Mapping[str, Tensor], u: Tensor) -> Tensor:
+    def shown(self, inputs: Inputs, u: Tensor) -> Tensor:
         """The picture (H, W, 3) sRGB of scene inputs, of which only those to which radiance is linear count; what
         controls do to the finished picture comes from `u`."""
         return self.traced.finished(self.radiance(inputs), self.collected.applied, u)
 
 
 def _collected(
-    renderer: Renderer,
-    u: Tensor,
-    seed: int,
-    tick: Tick,
-    spp: int,
-    quick: bool,
-    names: Collection[str] | None,
-    light: Mapping[str, Tensor],
+    renderer: Renderer, u: Tensor, seed: int, tick: Tick, spp: int, quick: bool, names: SomeNames, light: Inputs
 ) -> Linearised:
     before, (height, width) = renderer.non_finite, renderer.formation.resolution
     inputs = renderer.scene.assembly(renderer.space.inputs(u))
@@ -360,7 +350,6 @@ def _collected(
 
 
 def linear_inputs(renderer: Renderer) -> frozenset[str]:
-    """The inputs of a scene to which radiance is linear."""
     return frozenset(name for name in renderer.scene.names if name.endswith(LINEAR))
 
 

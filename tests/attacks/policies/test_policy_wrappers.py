@@ -35,7 +35,6 @@ from advsearch.attacks import (
     search,
     seeded,
 )
-from advsearch.attacks.evaluation import affordable
 from advsearch.attacks.policies import choices
 from advsearch.attacks.policies.choices import MOST, Stay, with_choices
 from advsearch.errors import InputError, UnknownNameError
@@ -169,11 +168,11 @@ def test_renders_that_gradients_did_not_take_are_for_the_rounds_to_come() -> Non
 def test_what_is_affordable() -> None:
     domain = replace(BOX, gradient_cost=3)
     wanted = Proposal(BOX.start, gradient=True, samples=2)
-    assert affordable(wanted, domain, 9) is wanted
-    assert affordable(wanted, domain, 8).gradient is False
-    assert affordable(wanted, domain, 1).samples == 1
+    assert wanted.affordable(domain, 9) is wanted
+    assert wanted.affordable(domain, 8).gradient is False
+    assert wanted.affordable(domain, 1).samples == 1
     free = Proposal(BOX.start, gradient="free", samples=2)
-    assert (free.cost(domain), affordable(free, domain, 3).gradient, affordable(free, domain, 2).gradient) == (
+    assert (free.cost(domain), free.affordable(domain, 3).gradient, free.affordable(domain, 2).gradient) == (
         2,
         "free",
         False,

@@ -47,19 +47,17 @@ class Setup:
         return image
 
     def adjoint(self, cotangent: Tensor, seed: int = 0, **options: Any) -> tuple[Tensor, Tensor]:
-        (by_vertices,), (by_normals,) = material_adjoint(
+        gradients = material_adjoint(
             self.scene,
             self.scene.sensors()[0],
             self.parameters,
-            names=["object"],
-            vertices=[self.vertices],
-            normals=[self.normals],
+            {"object.vertices": self.vertices, "object.normals": self.normals},
             cotangent=cotangent,
             seed=seed,
             max_depth=self.depth,
             **{"spp": SPP, **options},
         )
-        return by_vertices, by_normals
+        return gradients["object.vertices"], gradients["object.normals"]
 
     def difference(self, cotangent: Tensor, move: Callable[[float], tuple[Tensor, Tensor]], step: float) -> float:
         """Central difference along a motion with common random numbers."""

@@ -47,8 +47,8 @@ class Owner:
 def test_media_are_known_as_long_as_their_scene_and_loose_ones_for_good() -> None:
     population, owner = Population(), Owner()
     population.add(owner, media=("smoke",))
-    population.keep("haze")
-    assert population.media() == ["haze", "smoke"]
+    population.add(population, media=("haze",))
+    assert population.media() == ["smoke", "haze"]
     del owner
     population.bury()
     assert population.media() == ["haze"]
