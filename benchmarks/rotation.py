@@ -22,9 +22,8 @@ from advsearch import threads
 
 threads.configure()
 
-from torch import Tensor  # noqa: E402
 
-from advsearch.engine.gradients import estimated, inside, smooth_loss  # noqa: E402
+from advsearch.engine.gradients import Bench, inside, only, smooth_loss  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.engine.planning import measured_plan  # noqa: E402
 
@@ -51,13 +50,13 @@ def measured(environment: str, size: int, seconds: float) -> bool:
     controls = {"environment": {"rotation": [0, 360]}}
     renderer = load_scene("mug", environment).renderer(controls, resolution=size, denoise="none")
     renderer.formation = replace(renderer.formation, transfer="linear")
-    loss, u = smooth_loss((size, size)), inside(renderer)
+    bench = Bench(renderer, smooth_loss((size, size)), inside(renderer), seed=1, spp=SPP)
 
     def one(estimator: str, factor: float, seed: int) -> float:
-        gradient: Tensor = estimated(renderer, loss, u, estimator, ["environment.rotation"], seed, SPP, factor)
-        return float(gradient[0])
+        plan = only(renderer.plan.with_steps(factor), ["environment.rotation"], estimator)
+        return float(bench.gradient(plan, seed)[0])
 
-    renderer.plan = measured_plan(renderer, loss, u, seed=1, spp=SPP, repeats=6)
+    renderer.plan = measured_plan(bench, repeats=6)
     taken = renderer.plan.groups[0].estimator
     rows: list[tuple[float, ...]] = []
     begun = time.perf_counter()

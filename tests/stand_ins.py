@@ -123,7 +123,7 @@ def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume:
         stages = Stages(NullProgress())
         findings = attack_on(problem, config, make_policy(config.policy_name), stages, run).carry_out()
         if not findings.interrupted:
-            run.finish()
+            run.store.forget()
         return findings
 
 

@@ -29,7 +29,7 @@ def own_names(kind: str) -> list[str]:
         return [name for name, path in named.items() if f"class {name.title().replace('_', '')}Control(" in _text(path)]
     folder = {"policy": "attacks/policies", "task": "tasks"}[kind]
     found = re.findall(r'^    name(?:: ClassVar\[str\])? = "(\w+)"$', "\n".join(map(_text, _files(folder))), re.M)
-    return [name for name in found if name not in ("choices", "stay", "own", "ensemble")]  # nobody asks for these
+    return [name for name in found if name not in ("choices", "own", "ensemble")]  # nobody asks for these
 
 
 def _files(folder: str) -> Iterator[Path]:

@@ -77,7 +77,6 @@ class Deviation:
 
     @property
     def reason(self) -> str:
-        """What is too far off, in words."""
         if not self.share <= ACCEPTED:
             return f"{self.levels:.1f} levels of 255 off on the object, where {ACCEPTED * self.most:.1f} would do"
         return f"{self.logits:+.2f} off in the margin, where {self.margin:.2f} would do"
@@ -94,14 +93,9 @@ def compared(view: Callable[[int], ComparedView]) -> Deviation:
 
 
 def view_of(
-    renderer: Renderer,
-    predicted: Tensor,
-    u: Tensor,
-    seed: int,
-    spp: int,
-    margin: MarginOf,
+    renderer: Renderer, predicted: Tensor, u: Tensor, seed: int, spp: int, margin: MarginOf,
     before: Tensor | None = None,
-) -> ComparedView:
+) -> ComparedView:  # fmt: skip
     """Compare a predicted picture (H, W, 3) of a configuration u (d,) of the whole space with traced ones. The search
     renders with `spp` samples a pixel; `before` was predicted in its place before the search, if anything was."""
     with torch.no_grad():

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
-from advsearch.attacks.domain import Domain, Draws, centre_of_option
+from advsearch.attacks.domain import Domain, Draws
 from advsearch.attacks.evaluation import Query, WhichGradient
+from advsearch.attacks.policies.sampling import to_domain
 from advsearch.engine.acceptance import ComparedView
 from advsearch.engine.transport import PredictedSearch
 from advsearch.files import scaled
@@ -36,15 +37,11 @@ SOBOL_MOST = 64  # numbers of a condition up to which they are stratified
 
 def stratified(domain: Domain, number: int, seed: int) -> Tensor:
     """The condition with this number: as likely as any other, and as far from the ones before as may be."""
-    sizes = sum(block.size for block, _ in domain.parts())
-    if sizes > SOBOL_MOST or any(block.norm == "l2" for block, _ in domain.parts()):
+    if domain.dim > SOBOL_MOST or any(block.norm == "l2" for block in domain.blocks):
         generator = torch.Generator().manual_seed(seeds.stream(seed, "bank condition", number))
         return domain.sample(generator)[0]
-    noise = torch.from_numpy(Draws(sizes, "sobol", seed, "bank conditions").points(number, 1)[0]).float()
-    for block, part in domain.parts():
-        if block.options:
-            noise[part] = centre_of_option(noise[part], block.options)
-    return domain.project(torch.lerp(domain.lower, domain.upper, noise))
+    point = Draws(domain.dim, "sobol", seed, "bank conditions").points(number, 1)[0]
+    return to_domain(domain, torch.from_numpy(point).float())
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,11 +84,8 @@ class Bank(PredictedSearch):
         return sum(condition.renderer.entries for condition in self._held), self._bytes
 
     def conditions(self) -> BankOfConditions:
-        gap = self.gaps[-1] if self.gaps else None
-        made, grown = self._wanted(self._last), len(self.grown)
-        return BankOfConditions(made=made, dropped=self._dropped, grown=grown, gap=gap)
-
-    # ---- evaluations ------------------------------------------------------------------------------------------------
+        gap, grown = self.gaps[-1] if self.gaps else None, len(self.grown)
+        return BankOfConditions(made=self._wanted(self._last), dropped=self._dropped, grown=grown, gap=gap)
 
     def prepare(self, tick: Tick = lambda samples: None) -> None:
         self._fill(0, tick)
@@ -117,12 +111,11 @@ class Bank(PredictedSearch):
         return replace(evaluation, predicted=1)
 
     def _drawn(self, kind: str, index: int) -> list[Condition]:
-        """The conditions that an evaluation looks at: what is new, and a random choice of the rest."""
         count = min(self.problem.draws, len(self._held))
         before = self._wanted(index - 1 if kind == "search" else self._last)
         new = [condition for condition in self._held if condition.number >= before][:count]
-        rest = [condition for condition in self._held if condition.number < before]
-        return new + self._some(rest, count - len(new), f"bank {kind}", index)
+        others = [condition for condition in self._held if condition.number < before]
+        return new + self._some(others, count - len(new), f"bank {kind}", index)
 
     def _some(self, conditions: Sequence[Condition], count: int, stream: str, index: int) -> list[Condition]:
         generator = torch.Generator().manual_seed(seeds.stream(self.problem.seed, stream, index))
@@ -130,7 +123,6 @@ class Bank(PredictedSearch):
         return [conditions[number] for number in order[:count]]
 
     def _pictures(self, chosen: Sequence[Condition], u: Tensor) -> Tensor:
-        """Predicted pictures (N, H, W, 3) of u under conditions, with a graph."""
         inputs, pictures = self.problem.searched_space.inputs(u), []
         for condition in chosen:
             whole, made = torch.cat([u, condition.numbers]), condition.renderer
@@ -139,15 +131,12 @@ class Bank(PredictedSearch):
         return torch.stack(pictures)
 
     def _picture(self, u: Tensor) -> Tensor:
-        """The picture of u under the conditions that the scene comes with."""
         if self._still is None:
             seed = seeds.stream(self.problem.seed, "bank still")
             self._still = self.problem.linearised(self.problem.whole(self.problem.domain.start), seed, SPP)
             self.traced += 1
         with torch.no_grad():
             return self._still(self.problem.whole(u))
-
-    # ---- the bank ---------------------------------------------------------------------------------------------------
 
     def _wanted(self, index: int) -> int:
         """How many conditions have been collected by the evaluation with this index."""
@@ -174,26 +163,22 @@ class Bank(PredictedSearch):
                 self._until = self._wanted((index // EVERY + 1) * EVERY - 1)
                 self._coming = iter(self.trace([self._query(number) for number in range(first, self._until)]))
             for number in range(first, wanted):
-                self._held.append(self._condition(number))
-                self._bytes += self._held[-1].renderer.bytes
+                asked, dim = self._query(number), self.problem.domain.dim
+                made = self.problem.linearised(asked.u, asked.seed, SPP, next(self._coming).light)
+                self.traced += 1
+                with torch.no_grad():
+                    of_searched, alone = self.problem.searched_space.inputs(asked.u[:dim]), True
+                for name, there in made.there.items():
+                    alone = alone and name in of_searched and torch.equal(of_searched[name], there)
+                    if name in self._there and torch.equal(self._there[name], there):  # one tensor for all alike
+                        made.there[name] = self._there[name]
+                self._there = dict(made.there)
+                self._held.append(Condition(number, asked.u[dim:], made, alone))
+                self._bytes += made.bytes
                 tick(SPP)
                 while len(self._held) > 1 and self._bytes > scaled(MOST_BYTES):
                     self._bytes -= self._held.pop(0).renderer.bytes
                     self._dropped += 1
-
-    def _condition(self, number: int) -> Condition:
-        problem, asked = self.problem, self._query(number)
-        u, numbers = asked.u.split([problem.domain.dim, len(asked.u) - problem.domain.dim])
-        made = problem.linearised(asked.u, asked.seed, SPP, next(self._coming).light)
-        self.traced += 1
-        with torch.no_grad():
-            of_searched = problem.searched_space.inputs(u)
-        alone = all(name in of_searched and torch.equal(of_searched[name], there) for name, there in made.there.items())
-        for name, there in made.there.items():  # one tensor for all that are alike
-            if name in self._there and torch.equal(self._there[name], there):
-                made.there[name] = self._there[name]
-        self._there = dict(made.there)
-        return Condition(number, numbers, made, alone)
 
     def _compare(self, u: Tensor, index: int) -> None:
         """Look at unseen conditions and at the bank's own, and let the bank grow while the first are clearly better for

@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from itertools import groupby
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,6 +28,7 @@ SMALL = 0.1  # share of a control's largest derivative that each of its derivati
 COORDINATEWISE = 8  # groups of at most this many coordinates are probed one by one
 TOLERANCE = 0.05  # relative error that the mean of an estimator may have beyond the noise
 LOUD = 0.2  # noise of one gradient, relative to its size, from which it is called noisy
+SURE = 0.02  # standard error of a reference, relative to its size, from which on it gets no more seeds
 CONFIDENCE = 2.5  # standard errors within which two means agree
 TURNED = 0.0317  # share of a full turn by which periodic coordinates are off their start where gradients are measured
 FACTORS = (1.0, 3.0, 9.0, 1.0 / 3.0)
@@ -47,8 +49,7 @@ class Probe:
     step: float
 
 
-@dataclass(frozen=True)
-class Reference:
+class Reference(NamedTuple):
     """A derivative by high-sample central differences: the mean over seeds, extrapolated from two `steps` to zero
     (Richardson). Its `noise` is the standard error together with a quarter of the steps' disagreement; `factor` is the
     larger step as a multiple of the probe's."""
@@ -60,8 +61,7 @@ class Reference:
     factor: float = 1.0
 
 
-@dataclass(frozen=True)
-class Estimate:
+class Estimate(NamedTuple):
     """What one estimator says along a probe: the mean over seeds, the standard deviation (`noise`) and median seconds
     of one estimate. Differences are `factor` times as wide as planned."""
 
@@ -115,185 +115,10 @@ def inside(renderer: Renderer, share: float = 0.12) -> Tensor:
     return u
 
 
-def probes(renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int) -> list[Probe]:
-    """Return what is worth measuring in a renderer's space: every continuous coordinate, or a direction in many."""
-    along = []
-    for group in renderer.plan.groups:
-        if group.estimator == "none":
-            continue
-        for number in range(group.size) if group.size <= COORDINATEWISE else ():
-            direction = torch.zeros_like(u)
-            direction[group.begin + number] = 1.0
-            name = group.name if group.size == 1 else f"{group.name}.{number}"
-            along.append(Probe(group, name, direction, group.step))
-        if group.size > COORDINATEWISE:
-            # mostly the estimator's own gradient, so that there is something to see, and a share of random signs, so
-            # that what the estimator leaves out shows too
-            gradient = estimated(renderer, loss, u, group.estimator, [group.name], seeds.stream(seed, "probe"), spp)
-            generator = torch.Generator().manual_seed(seeds.stream(seed, "probe signs"))
-            part, direction = gradient[group.coordinates], torch.zeros_like(u)
-            signs = torch.randint(0, 2, part.shape, generator=generator).to(part.dtype) * 2.0 - 1.0
-            mixed = part.sign() + 0.5 * signs
-            direction[group.coordinates] = mixed / mixed.abs().max().clamp_min(1e-12)
-            along.append(Probe(group, group.name, direction, group.step if group.size <= 64 else 0.03))
-    return along
-
-
 def only(plan: GradientPlan, names: Collection[str], estimator: str | None = None) -> GradientPlan:
     """Return the plan with the groups of these names differentiated, by an estimator or as planned, and no others."""
     chosen = {group.name: (estimator or group.estimator) if group.name in names else "none" for group in plan.groups}
     return replace(plan, groups=tuple(replace(group, estimator=chosen[group.name]) for group in plan.groups))
-
-
-def estimated(
-    renderer: Renderer,
-    loss: Loss,
-    u: Tensor,
-    estimator: str,
-    names: Collection[str],
-    seed: int,
-    spp: int,
-    factor: float = 1.0,
-) -> Tensor:
-    """Return one gradient (d,) of the groups of these names by one estimator, its differences `factor` times as wide
-    as planned; zero elsewhere."""
-    return _by(renderer, loss, u, only(renderer.plan.with_steps(factor), names, estimator), seed, spp)
-
-
-def _by(renderer: Renderer, loss: Loss, u: Tensor, plan: GradientPlan, seed: int, spp: int) -> Tensor:
-    """One gradient (d,) by a plan of its own."""
-    before, renderer.plan = renderer.plan, plan
-    try:
-        return renderer.gradient(loss, u, seed, spp)[1]
-    finally:
-        renderer.plan = before
-
-
-Keep = Callable[[str, Callable[[], Any]], Any]
-"""From the name of a measurement, and what makes it, to a JSON value: one that is known already, or what it makes."""
-
-
-def measured_now(name: str, measure: Callable[[], Any]) -> Any:
-    """Return what a measurement makes: the `Keep` that keeps nothing."""
-    return measure()
-
-
-def gradients(
-    renderer: Renderer,
-    loss: Loss,
-    u: Tensor,
-    plan: GradientPlan,
-    stream: str,
-    *,
-    seed: int,
-    spp: int,
-    repeats: int,
-    keep: Keep = measured_now,
-    place: str = "",
-    tick: Callable[[], None] = lambda: None,
-) -> tuple[Tensor, float]:
-    """Return gradients (repeats, d) at u by a plan, zero where it takes no derivative, and the median seconds of one.
-
-    Each has a seed of its own: a number in the `stream` of the root `seed`. `keep` is asked for each, as `place` and
-    its number; `tick` is called after each.
-    """
-    parts = [group.coordinates for group in plan.groups if group.estimator != "none"]
-
-    def timed(number: int) -> dict[str, Any]:
-        begun = time.perf_counter()
-        gradient = _by(renderer, loss, u, plan, seeds.stream(seed, stream, number), spp)
-        taken = torch.cat([gradient[part] for part in parts])
-        numbers = base64.b64encode(taken.to(torch.float32).numpy().tobytes()).decode("ascii")
-        return {"seconds": time.perf_counter() - begun, "numbers": numbers}
-
-    several, times = torch.zeros(repeats, len(u)), []
-    for number in range(repeats):
-        kept = keep(f"{place} gradient {number}", partial(timed, number))
-        numbers = torch.frombuffer(bytearray(base64.b64decode(kept["numbers"])), dtype=torch.float32)
-        for part, values in zip(parts, numbers.split([part.stop - part.start for part in parts]), strict=True):
-            several[number, part] = values
-        times.append(kept["seconds"])
-        tick()
-    return several, statistics.median(times)
-
-
-def estimates(
-    renderer: Renderer,
-    loss: Loss,
-    u: Tensor,
-    estimator: str,
-    along: Sequence[Probe],
-    *,
-    seed: int,
-    spp: int,
-    repeats: int = 6,
-    factor: float = 1.0,
-) -> list[Estimate]:
-    """Measure one estimator of one control's groups along some probes of them; `factor` as in `estimated`."""
-    plan = only(renderer.plan.with_steps(factor), {probe.group.name for probe in along}, estimator)
-    stream = estimator if factor == 1.0 else f"{estimator} x {factor:g}"
-    several, seconds = gradients(renderer, loss, u, plan, stream, seed=seed, spp=spp, repeats=repeats)
-    values = [[float(gradient @ probe.direction) for gradient in several] for probe in along]
-    return [
-        Estimate(estimator, statistics.fmean(each), statistics.stdev(each), repeats, seconds, factor) for each in values
-    ]
-
-
-def reference(
-    renderer: Renderer,
-    loss: Loss,
-    u: Tensor,
-    probe: Probe,
-    *,
-    seed: int,
-    spp: int,
-    goal: float = 0.02,
-    repeats: tuple[int, int] = (3, 16),
-    factors: Sequence[float] = (1.0,),
-) -> Reference:
-    """Return the derivative along a probe by central differences at two steps, with its noise.
-
-    Seeds are added until the standard error is below `goal` of the value, between the two numbers of `repeats`. With
-    several `factors`, each gets the smaller number of seeds, both steps so many times wider, until one is sure enough;
-    if none is, the one with the least noise goes on.
-    """
-    before, measured, errors = renderer.renders, dict[float, Reference](), dict[float, float]()
-    pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
-
-    def difference(step: float, seed: int) -> float:
-        """The central one, one-sided as far as the box asks for it."""
-        move, width = step * probe.direction, 2.0 * step
-        if probe.group.periodic:
-            above, below = (u + move).remainder(1.0), (u - move).remainder(1.0)
-        else:
-            above, below = (u + move).clamp(0.0, 1.0), (u - move).clamp(0.0, 1.0)
-            if probe.group.size <= COORDINATEWISE:
-                width = float((above - below) @ probe.direction)
-        with torch.no_grad():
-            return (float(loss(renderer(above, seed, spp))) - float(loss(renderer(below, seed, spp)))) / width
-
-    def measure(factor: float, count: int) -> None:
-        """Take differences at a step and at half of it until there are so many pairs, of the same seeds each."""
-        step = probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step)
-        for number in range(len(pairs[factor]), count):
-            noise = seeds.stream(seed, "reference", number)
-            pairs[factor].append((difference(step, noise), difference(0.5 * step, noise)))
-        values = [(4.0 * fine - coarse) / 3.0 for coarse, fine in pairs[factor]]
-        both = statistics.fmean(wide for wide, _ in pairs[factor]), statistics.fmean(fine for _, fine in pairs[factor])
-        error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.inf
-        noise_of_both = math.hypot(error, 0.25 * (both[0] - both[1]))
-        measured[factor], errors[factor] = Reference(statistics.fmean(values), noise_of_both, both, 0, factor), error
-
-    for factor in factors:
-        measure(factor, repeats[0])
-        if errors[factor] <= goal * abs(measured[factor].value):
-            best = factor
-            break
-    else:
-        best = min(measured, key=lambda factor: measured[factor].noise)
-        while errors[best] > goal * abs(measured[best].value) and len(pairs[best]) < repeats[1]:
-            measure(best, len(pairs[best]) + 1)
-    return replace(measured[best], renders=renderer.renders - before)
 
 
 def agreement(
@@ -321,23 +146,17 @@ def agreement(
         return value / size if size > 0.0 else math.inf if value else 0.0
 
     return Measured(
-        quantity="derivative",
-        control=probe.group.control if probe else "",
-        parameter=probe.name.partition(".")[2] if probe else "",
-        estimator=estimate.estimator,
-        factor=estimate.factor,
-        spp=spp,
-        repeats=estimate.repeats,
-        seconds=estimate.seconds,
-        status=status,
-        error=relative(math.hypot(difference, estimate.noise)),
-        bias=relative(difference),
-        doubt=relative(doubt) if size > 0.0 else 0.0,
-        noise=relative(estimate.noise) if size > 0.0 else math.inf,
-        value=estimate.value,
-        reference=against.value,
-        reference_error=relative(against.noise),
-    )
+        quantity="derivative", control=probe.group.control if probe else "",
+        parameter=probe.name.partition(".")[2] if probe else "", estimator=estimate.estimator, factor=estimate.factor,
+        spp=spp, repeats=estimate.repeats, seconds=estimate.seconds, status=status,
+        error=relative(math.hypot(difference, estimate.noise)), bias=relative(difference),
+        doubt=relative(doubt) if size > 0.0 else 0.0, noise=relative(estimate.noise) if size > 0.0 else math.inf,
+        value=estimate.value, reference=against.value, reference_error=relative(against.noise),
+    )  # fmt: skip
+
+
+def as_planned(group: Group) -> list[tuple[str, float]]:
+    return [(group.estimator, 1.0)]
 
 
 def attempts(group: Group) -> list[tuple[str, float]]:
@@ -346,7 +165,7 @@ def attempts(group: Group) -> list[tuple[str, float]]:
     Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.
     """
     forced, steps = "forced" in group.reason, {group.step}
-    tries = [(name, 1.0) for name in ([group.estimator] if forced else compared(group.valid, group.size))]
+    tries = as_planned(group) if forced else [(name, 1.0) for name in compared(group.valid, group.size)]
     wide = [name for name in ("differences", "secant") if (name, 1.0) in tries][:1]
     for factor in FACTORS[1:]:
         step = min(factor * group.step, STEP_RANGE[1])
@@ -356,60 +175,182 @@ def attempts(group: Group) -> list[tuple[str, float]]:
     return tries
 
 
-def derivatives(
-    renderer: Renderer,
-    loss: Loss,
-    u: Tensor,
-    *,
-    seed: int,
-    spp: int,
-    reference_spp: int,
-    seeds_of_reference: tuple[int, int],
-    reference_factors: Sequence[float] = (1.0,),
-    tried: Callable[[Group], Sequence[tuple[str, float]]] = lambda group: [(group.estimator, 1.0)],
-    repeats: tuple[int, int] = (6, 8),
-    value: Callable[[str, Any, Callable[[], Any]], Any] = lambda name, kind, measure: measure(),
-    stage: Callable[[str, int], None] = lambda name, steps: None,
-    tick: Callable[[], None] = lambda: None,
-) -> Iterator[Measured]:
-    """Measure the derivative by each parameter of a renderer's space beside differences of many samples.
+Keep = Callable[[str, Callable[[], Any]], Any]
+"""From the name of a measurement, and what makes it, to a JSON value: one that is known already, or what it makes."""
 
-    Args:
-        reference_spp, seeds_of_reference, reference_factors: as of `reference`.
-        tried: from a group the estimators to try, by default as planned, with multiples of the step; a wider one on
-            what is not `ok` yet.
-        repeats: gradients by an estimator at first, and by one with another step, which has to be surer.
-        value: is asked for each measurement, by a name and the type of what the last argument measures.
-        stage, tick: are told what begins and of how many steps, and of each step.
-    """
-    along = probes(renderer, loss, u, seed, spp)
-    for control in dict.fromkeys(probe.group.control for probe in along):
-        mine = [probe for probe in along if probe.group.control == control]
-        stage(f"references for {control}", len(mine))
-        references: dict[str, Reference] = {}
-        for probe in mine:
-            # what acts on the picture clips: its mean depends on the noise, so both get the same
-            many = spp if probe.group.estimator == "image" else max(spp, reference_spp)
-            measure = partial(reference, renderer, loss, u, probe, seed=seed, spp=many, repeats=seeds_of_reference)
-            measure = partial(measure, factors=reference_factors)
-            references[probe.name] = value(f"reference {probe.name}", Reference, measure)
-            tick()
-        sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}  # each comes from one gradient
-        for probe in mine:
-            sets.setdefault((probe.group.valid, probe.group.estimator), []).append(probe)
-        stage(f"gradients for {control}", sum(len(tried(members[0].group)) for members in sets.values()))
-        for members in sets.values():
-            good: set[str] = set()
-            for estimator, factor in tried(members[0].group):
-                wanted = members if factor == 1.0 else [probe for probe in members if probe.name not in good]
-                if not wanted:
-                    break
-                count = repeats[0] if factor == 1.0 else repeats[1]
-                taken = partial(estimates, renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=count)
-                name = f"{estimator} x {factor:g} {','.join(probe.name for probe in wanted)}"
-                measured = value(name, list[Estimate], partial(taken, factor=factor))
-                for probe, estimate in zip(wanted, measured, strict=True):
-                    row = agreement(estimate, references[probe.name], list(references.values()), probe, spp)
-                    good |= {probe.name} if row.status == "ok" else set()
-                    yield row
-                tick()
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """Where derivatives are measured: of a loss of the picture at u (d,), with `spp` samples a pixel and noise from a
+    root `seed`. `keep` is asked for each measurement; `tick` is told the samples of each gradient that is done."""
+
+    renderer: Renderer
+    loss: Loss
+    u: Tensor
+    seed: int
+    spp: int
+    keep: Keep = lambda name, measure: measure()
+    tick: Callable[[int], object] = lambda samples: None
+
+    def gradient(self, plan: GradientPlan, seed: int) -> Tensor:
+        """Return one gradient (d,) by a plan, under noise of its own."""
+        before, self.renderer.plan = self.renderer.plan, plan
+        try:
+            return self.renderer.gradient(self.loss, self.u, seed, self.spp)[1]
+        finally:
+            self.renderer.plan = before
+
+    def gradients(
+        self, plan: GradientPlan, stream: str, repeats: int, place: str | None = None
+    ) -> tuple[Tensor, float]:
+        """Return gradients (repeats, d) by a plan, zero where it takes no derivative, and the median seconds of one;
+        the seed of each is its number in a stream. Each is kept where a `place` names them."""
+        parts = [group.coordinates for group in plan.groups if group.estimator != "none"]
+
+        def timed(number: int) -> dict[str, Any]:
+            begun = time.perf_counter()
+            gradient = self.gradient(plan, seeds.stream(self.seed, stream, number))
+            taken = torch.cat([gradient[part] for part in parts])
+            numbers = base64.b64encode(taken.to(torch.float32).numpy().tobytes()).decode("ascii")
+            return {"seconds": time.perf_counter() - begun, "numbers": numbers}
+
+        several, times = torch.zeros(repeats, len(self.u)), []
+        for number in range(repeats):
+            measure = partial(timed, number)
+            kept = measure() if place is None else self.keep(f"{place} gradient {number}", measure)
+            numbers = torch.frombuffer(bytearray(base64.b64decode(kept["numbers"])), dtype=torch.float32)
+            for part, values in zip(parts, numbers.split([part.stop - part.start for part in parts]), strict=True):
+                several[number, part] = values
+            times.append(kept["seconds"])
+            if place is not None:
+                self.tick(self.spp)
+        return several, statistics.median(times)
+
+    def probes(self) -> list[Probe]:
+        """Return what is worth measuring in a renderer's space: every continuous coordinate, or a direction in many."""
+        along = []
+        for group in self.renderer.plan.groups:
+            if group.estimator == "none":
+                continue
+            for number in range(group.size) if group.size <= COORDINATEWISE else ():
+                direction = torch.zeros_like(self.u)
+                direction[group.begin + number] = 1.0
+                name = group.name if group.size == 1 else f"{group.name}.{number}"
+                along.append(Probe(group, name, direction, group.step))
+            if group.size > COORDINATEWISE:
+                # mostly the estimator's own gradient, so that there is something to see, and a share of random signs,
+                # so that what the estimator leaves out shows too
+                gradient = self.gradient(only(self.renderer.plan, [group.name]), seeds.stream(self.seed, "probe"))
+                generator = torch.Generator().manual_seed(seeds.stream(self.seed, "probe signs"))
+                part, direction = gradient[group.coordinates], torch.zeros_like(self.u)
+                signs = torch.randint(0, 2, part.shape, generator=generator).to(part.dtype) * 2.0 - 1.0
+                mixed = part.sign() + 0.5 * signs
+                direction[group.coordinates] = mixed / mixed.abs().max().clamp_min(1e-12)
+                along.append(Probe(group, group.name, direction, group.step if group.size <= 64 else 0.03))
+        return along
+
+    def reference(
+        self, probe: Probe, *, repeats: tuple[int, int] = (3, 16), factors: Sequence[float] = (1.0,)
+    ) -> Reference:
+        """Return the derivative along a probe by central differences at two steps, with its noise.
+
+        Seeds are added until the standard error is below `SURE` of the value, between the two numbers of `repeats`.
+        With several `factors`, each gets the smaller number of seeds, both steps so many times wider, until one is sure
+        enough; if none is, the one with the least noise goes on.
+        """
+        before, u = self.renderer.renders, self.u
+        pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
+
+        def difference(step: float, seed: int) -> float:
+            move, width = step * probe.direction, 2.0 * step
+            if probe.group.periodic:
+                above, below = (u + move).remainder(1.0), (u - move).remainder(1.0)
+            else:
+                above, below = (u + move).clamp(0.0, 1.0), (u - move).clamp(0.0, 1.0)
+                if probe.group.size <= COORDINATEWISE:
+                    width = float((above - below) @ probe.direction)
+            with torch.no_grad():
+                high, low = (float(self.loss(self.renderer(at, seed, self.spp))) for at in (above, below))
+            return (high - low) / width
+
+        def measure(factor: float, count: int) -> tuple[Reference, float]:
+            """Take differences at a step and at half of it until there are so many pairs, of the same seeds each."""
+            step = probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step)
+            for number in range(len(pairs[factor]), count):
+                noise = seeds.stream(self.seed, "reference", number)
+                pairs[factor].append((difference(step, noise), difference(0.5 * step, noise)))
+            coarse, fine = zip(*pairs[factor], strict=True)
+            values = [(4.0 * half - whole) / 3.0 for whole, half in pairs[factor]]
+            both = statistics.fmean(coarse), statistics.fmean(fine)
+            error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.inf
+            noise_of_both = math.hypot(error, 0.25 * (both[0] - both[1]))
+            return Reference(statistics.fmean(values), noise_of_both, both, 0, factor), error
+
+        measured = dict[float, tuple[Reference, float]]()
+        for factor in factors:
+            taken, error = measured[factor] = measure(factor, repeats[0])
+            if error <= SURE * abs(taken.value):
+                break
+        else:
+            best = min(measured, key=lambda factor: measured[factor][0].noise)
+            taken, error = measured[best]
+            while error > SURE * abs(taken.value) and len(pairs[best]) < repeats[1]:
+                taken, error = measure(best, len(pairs[best]) + 1)
+        return taken._replace(renders=self.renderer.renders - before)
+
+    def estimates(self, estimator: str, along: Sequence[Probe], repeats: int, factor: float) -> list[Estimate]:
+        """Measure one estimator of one control's groups along some probes of them, its differences `factor` times as
+        wide as planned."""
+        plan = only(self.renderer.plan.with_steps(factor), {probe.group.name for probe in along}, estimator)
+        stream = estimator if factor == 1.0 else f"{estimator} x {factor:g}"
+        several, seconds = self.gradients(plan, stream, repeats)
+        values = [[float(gradient @ probe.direction) for gradient in several] for probe in along]
+        return [
+            Estimate(estimator, statistics.fmean(each), statistics.stdev(each), repeats, seconds, factor)
+            for each in values
+        ]
+
+    def derivatives(
+        self, *, reference_spp: int, seeds_of_reference: tuple[int, int], reference_factors: Sequence[float] = (1.0,),
+        tried: Callable[[Group], Sequence[tuple[str, float]]] = as_planned, repeats: tuple[int, int] = (6, 8),
+        stage: Callable[[str, int], None] = lambda name, steps: None,
+    ) -> Iterator[Measured]:  # fmt: skip
+        """Measure the derivative by each parameter of a renderer's space beside differences of many samples.
+
+        Args:
+            reference_spp, seeds_of_reference, reference_factors: as of `reference`.
+            tried: from a group the estimators to try, by default as planned, with multiples of the step; a wider one on
+                what is not `ok` yet.
+            repeats: gradients by an estimator at first, and by one with another step, which has to be surer.
+            stage: is told what begins and of how many steps.
+        """
+        for control, probes in groupby(self.probes(), lambda probe: probe.group.control):
+            mine = list(probes)
+            stage(f"references for {control}", len(mine))
+            references: dict[str, Reference] = {}
+            for probe in mine:
+                # what acts on the picture clips: its mean depends on the noise, so both get the same
+                many = self.spp if probe.group.estimator == "image" else max(self.spp, reference_spp)
+                measure = partial(replace(self, spp=many).reference, probe, repeats=seeds_of_reference)
+                kept = self.keep(f"reference {probe.name}", partial(measure, factors=reference_factors))
+                references[probe.name] = Reference(*kept)
+                self.tick(self.spp)
+            sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}  # each comes from one gradient
+            for probe in mine:
+                sets.setdefault((probe.group.valid, probe.group.estimator), []).append(probe)
+            stage(f"gradients for {control}", sum(len(tried(members[0].group)) for members in sets.values()))
+            for members in sets.values():
+                good: set[str] = set()
+                for estimator, factor in tried(members[0].group):
+                    wanted = members if factor == 1.0 else [probe for probe in members if probe.name not in good]
+                    if not wanted:
+                        break
+                    count = repeats[0] if factor == 1.0 else repeats[1]
+                    name = f"{estimator} x {factor:g} {','.join(probe.name for probe in wanted)}"
+                    estimates = self.keep(name, partial(self.estimates, estimator, wanted, count, factor))
+                    for probe, estimate in zip(wanted, estimates, strict=True):
+                        others = list(references.values())
+                        row = agreement(Estimate(*estimate), references[probe.name], others, probe, self.spp)
+                        good |= {probe.name} if row.status == "ok" else set()
+                        yield row
+                    self.tick(self.spp)

@@ -62,14 +62,8 @@ class Shared:
             raise RuntimeError("a sweep has a problem for each scene and model, and none of its own")
         return self.own
 
-    def __call__(self, queries: Sequence[Query]) -> Iterable[Evaluation]:
-        if self.executor is None or len(queries) < 2:
-            return map(self.problem.evaluate, queries)
-        return self._sent(self.executor, queries)
-
     @property
     def facts(self) -> Workforce | None:
-        """How the workers do; None where there are none."""
         return None if self.executor is None else self.executor.facts
 
     @property
@@ -77,12 +71,15 @@ class Shared:
         """The same, beside a bar."""
         return {} if self.facts is None else self.facts.told
 
-    def _sent(self, executor: Executor, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        """What workers say, each when it is its turn."""
+    def __call__(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        """Answer queries, each when it is its turn."""
+        if self.executor is None or len(queries) < 2:
+            yield from map(self.problem.evaluate, queries)
+            return
         sent: list[Sent] = [(self.name, self.problem.prepared, query) for query in queries]
         early, turn = dict[int, Evaluation](), 0
         numbers = {id(item): number for number, item in enumerate(sent)}
-        results: Any = executor.results([item] for item in sent)
+        results: Any = self.executor.results([item] for item in sent)
         with closing(results):
             for done in results:
                 number = numbers[id(done.items[0])]
@@ -167,22 +164,17 @@ def weights_digest(model: Model) -> str | None:
 
 def same(before: Sequence[float | None], now: Sequence[float | None]) -> bool:
     """Whether values of a picture are those that they were; None is no number."""
-
-    def near(one: float | None, other: float | None) -> bool:
-        if one is None or other is None:
-            return one is other
-        return abs(one - other) <= max(LEAST, NEAR * max(abs(one), abs(other)))
-
-    return len(before) == len(now) and all(map(near, before, now))
+    numbers = [[math.inf if value is None else value for value in values] for values in (before, now)]
+    close = partial(math.isclose, rel_tol=NEAR, abs_tol=LEAST)
+    return len(before) == len(now) and all(map(close, *numbers))
 
 
 def finite(value: float | None) -> float | None:
-    """Return a number, None where it is none."""
     return value if value is not None and math.isfinite(value) else None
 
 
 def _function(function: Callable[..., Any]) -> dict[str, str | None]:
-    """What is noted of a function: its source for a reader, and a digest of what it does, whatever it looks like."""
+    """A function's source, for a reader, and a digest of what it does, whatever it looks like."""
     while isinstance(function, partial):
         function = function.func
     bare = inspect.unwrap(function)
@@ -224,60 +216,33 @@ def _plain(value: Any) -> Any:
 MACHINES = "machines"  # the note under which the store keeps what they are
 
 
-@dataclass
-class Machines:
-    """The other machines of a run: what each is, by the name that rows have. Without a run it is kept in memory."""
-
-    run: RunDirectory | None
-    known: dict[str, dict[str, str]] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.known = (self.run.store.noted(MACHINES) if self.run is not None else None) or {}
-
-    def meet(self, name: str | None, facts: Workforce | None) -> None:
-        """Keep what a machine is, unless it is known, or like this one (None)."""
-        if name is None or name in self.known:
-            return
-        self.known[name] = dict(facts.machines.get(name, {})) if facts is not None else {}
-        if self.run is not None:
-            self.run.store.set_note(MACHINES, json.dumps(self.known))
-
-    @property
-    def remarks(self) -> list[str]:
-        """What a reader has to know."""
-        if not self.known:
-            return []
-        told = "; ".join(", ".join(f"{key} {text}" for key, text in facts.items()) for facts in self.known.values())
-        return [
-            "Rows come from machines that are not alike, so that their last bits may differ; beside the one that kept "
-            f"the run: {told}."
-        ]
-
-
 PLAN = "gradient plan"  # the note under which the store keeps how derivatives are obtained
 
 
 @dataclass
 class Journal:
     """What a run has asked and was answered, without a run directory kept in `rows`; `traced` answers what nothing
-    predicts. It counts queries that nobody could answer (`lost`), and knows the machines that are not like this one."""
+    predicts. It counts queries that nobody could answer (`lost`), and knows the machines that are not like this one, by
+    the names that rows have."""
 
     run: RunDirectory | None
     traced: Shared
     rows: list[Row] = field(default_factory=list)
     lost: int = 0
-    machines: Machines = field(default_factory=lambda: Machines(None))
+    machines: dict[str, dict[str, str]] = field(default_factory=dict)
     _counts: dict[str, int] = field(default_factory=dict)
     _trials: dict[str, dict[int, Evaluation]] = field(default_factory=dict)
+    _opened: bool = False
 
     @property
     def problem(self) -> Problem:
         return self.traced.problem
 
     def __post_init__(self) -> None:
-        if self.run is not None and self.machines.run is None:  # not that of another problem of the same run
-            self.machines = Machines(self.run)
+        if self.run is not None and not self._opened:  # once, and not for another problem of the same run
+            self.machines |= self.note(MACHINES) or {}
             self._counts |= self.run.store.counts()
+            self._opened = True
 
     # ---- queries ----------------------------------------------------------------------------------------------------
 
@@ -314,22 +279,20 @@ class Journal:
             self.lost += sum(trial.said.prediction.label == LOST for trial in self._trials[kind].values())
         return self._trials[kind]
 
-    def _holds(self, query: Query) -> bool:
-        """Whether an evaluation of a search had its row when the run was opened."""
-        return query.number < self._counts.get(query.kind, 0)
-
     def _read(self, query: Query) -> Evaluation | None:
         if query.phase is None:
             return self._trials_of(query.kind).get(query.number)
-        told = self.run.store.told(query.kind, query.number) if self.run is not None and self._holds(query) else None
-        if told is None:
+        if self.run is None or query.number >= self._counts.get(query.kind, 0):
             return None
-        row, beside = told
+        stored = self.run.store.told(query.kind, query.number)
+        if stored is None:
+            return None
+        row, beside = stored
         if beside.u != digest(query.u) or row.seed != query.seed:
-            path, again = ("", "") if self.run is None else (self.run.path, self.run.again)
             raise InputError(
-                f"{path}: cannot resume: evaluation {query.number} of the {query.kind} is not the one that was stored, "
-                f"so advsearch, its packages or the number of threads have changed since; {again}"
+                f"{self.run.path}: cannot resume: evaluation {query.number} of the {query.kind} is not the one that "
+                "was stored, so advsearch, its packages or the number of threads have changed since; "
+                f"{self.run.again}"
             )
         if beside.non_finite:
             self.problem.renderer.non_finite += beside.non_finite
@@ -349,8 +312,10 @@ class Journal:
         rows, told = list[Row](), None
         for query, evaluation in evaluated:
             self.lost += evaluation.lost
-            if evaluation.machine is not None:
-                self.machines.meet(evaluation.machine, self.traced.facts)
+            if (name := evaluation.machine) is not None and name not in self.machines:
+                facts = self.traced.facts
+                self.machines[name] = {} if facts is None else dict(facts.machines.get(name, {}))
+                self.set_note(MACHINES, self.machines)
             if query.phase is None:
                 values = dict(query.values)
                 if query.drawn:
@@ -361,7 +326,7 @@ class Journal:
                 row = replace(row, machine=evaluation.machine, renders=evaluation.cost, seconds=evaluation.seconds)
                 if not numbered:
                     self._trials_of(query.kind)[query.number] = replace(evaluation, picture=None)
-            elif self._holds(query):  # of a run that was done
+            elif query.number < self._counts.get(query.kind, 0):  # it had a row when the run, done by then, was opened
                 continue
             else:
                 row, told = self._row_of_search(query, evaluation)
@@ -374,28 +339,18 @@ class Journal:
         return rows
 
     def _row_of_search(self, query: Query, evaluation: Evaluation) -> tuple[Row, Told]:
-        problem = self.problem
+        problem, finite, gradient, picture = self.problem, evaluation.finite, evaluation.gradient, evaluation.picture
         row = Row(
-            kind=query.kind,
-            step=query.number,
-            seed=query.seed,
-            spp=None if evaluation.predicted else problem.spp * query.samples,
-            objective=evaluation.objective if (finite := evaluation.finite) else math.nan,
-            success=evaluation.success and finite,
-            values=problem.describe(query.u),
-            seconds=evaluation.seconds,
-            renders=0 if evaluation.predicted else evaluation.cost * problem.draws,
-            phase=query.phase,
-            machine=evaluation.machine,
-        )
+            query.kind, query.number, query.seed, None if evaluation.predicted else problem.spp * query.samples,
+            objective=evaluation.objective if finite else math.nan, success=evaluation.success and finite,
+            values=problem.describe(query.u), seconds=evaluation.seconds, phase=query.phase,
+            renders=0 if evaluation.predicted else evaluation.cost * problem.draws, machine=evaluation.machine,
+        )  # fmt: skip
         told = Told(
-            number=query.number,
-            u=digest(query.u),
-            non_finite=evaluation.non_finite,
-            cost=evaluation.cost,
-            gradient=None if evaluation.gradient is None else evaluation.gradient.detach().numpy(),
-            picture=None if evaluation.picture is None else levels_of(evaluation.picture).numpy(),
-        )
+            query.number, digest(query.u), evaluation.non_finite, evaluation.cost,
+            None if gradient is None else gradient.detach().numpy(),
+            None if picture is None else levels_of(picture).numpy(),
+        )  # fmt: skip
         return row if evaluation.judgement is None else judged(row, evaluation.judgement), told
 
     def clock(self, kind: str, seconds: float | None) -> Callable[[int], bool] | None:
@@ -420,6 +375,17 @@ class Journal:
 
         return late
 
+    @property
+    def remarks(self) -> list[str]:
+        """What a reader has to know of the other machines."""
+        if not self.machines:
+            return []
+        told = "; ".join(", ".join(f"{key} {text}" for key, text in facts.items()) for facts in self.machines.values())
+        return [
+            "Rows come from machines that are not alike, so that their last bits may differ; beside the one that kept "
+            f"the run: {told}."
+        ]
+
     # ---- notes ------------------------------------------------------------------------------------------------------
 
     def note(self, key: str) -> Any:
@@ -443,5 +409,4 @@ def other_numbers(run: RunDirectory | None, values: Mapping[str, tuple[float | N
 
 
 def digest(u: Tensor) -> bytes:
-    """Return what tells a configuration from others."""
     return hashlib.blake2b(np.ascontiguousarray(u.detach().numpy()).tobytes(), digest_size=16).digest()

@@ -7,9 +7,9 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import replace
 from importlib import import_module
+from itertools import product
 from operator import attrgetter
 from types import MappingProxyType
 from typing import Any, Literal
@@ -26,7 +26,7 @@ from advsearch.controls.base import Control
 from advsearch.copies import copied
 from advsearch.described import Value
 from advsearch.engine.loading import Scene
-from advsearch.engine.rendering import facts_about, pictures_of, render, things_seen
+from advsearch.engine.rendering import facts_about, pictures_of, render
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonObject
 from advsearch.models import Model
@@ -40,7 +40,6 @@ from advsearch.scene.description import OBJECT
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surfaces import Surfaces
 from advsearch.scene.things import ALL
-from advsearch.scene.transport.matrix import linear_inputs
 from advsearch.tasks import Facts, Judgement, Task
 from advsearch.tasks.base import Output, Truth, mean
 from advsearch.tasks.together import Ensemble, Outputs, Together, of_each
@@ -58,22 +57,23 @@ def metrics_as_settings(metrics: Mapping[str, str | Metric]) -> dict[str, str]:
     """Return metrics as a file names them: "package.module:function"; one that cannot be named, by its bare name."""
     if not isinstance(metrics, Mapping) or not all(isinstance(name, str) for name in metrics):
         raise InputError(f'metrics: expected a mapping from names to functions, as {{"f": f}}, got {metrics!r:.80}')
+    settings = {}
     for name, function in metrics.items():
         if name in (*OWN, *AFTER) or not name:
             raise InputError(f"metrics: {name!r} is a column that rows have already; choose another name")
-        if not (callable(function) or isinstance(function, str)):
+        if isinstance(function, str):
+            settings[name] = function
+            continue
+        if not callable(function):
             raise InputError(f"metrics: {name}: expected a function of (image, output, truth), got {function!r:.80}")
-        if not isinstance(function, str):
-            check_takes(f"metrics: {name}", function, "image", "output", "truth")
-    return {name: function if isinstance(function, str) else _text(function) for name, function in metrics.items()}
-
-
-def _text(metric: Metric) -> str:
-    module, name = getattr(metric, "__module__", None), getattr(metric, "__qualname__", None)
-    named: Any = sys.modules.get(str(module))
-    for part in str(name).split("."):
-        named = getattr(named, part, None)
-    return f"{module}:{name}" if named is metric else str(getattr(metric, "__name__", type(metric).__name__))
+        check_takes(f"metrics: {name}", function, "image", "output", "truth")
+        module, place = str(getattr(function, "__module__", None)), str(getattr(function, "__qualname__", None))
+        named: Any = sys.modules.get(module)
+        for part in place.split("."):
+            named = getattr(named, part, None)
+        bare = str(getattr(function, "__name__", type(function).__name__))
+        settings[name] = f"{module}:{place}" if named is function else bare
+    return settings
 
 
 def only_here(settings: Mapping[str, str]) -> list[str]:
@@ -82,7 +82,6 @@ def only_here(settings: Mapping[str, str]) -> list[str]:
 
 
 def check_shared(settings: Mapping[str, str]) -> None:
-    """Refuse metrics that workers could not import."""
     for name in only_here(settings):
         raise InputError(
             f"metrics: {name}: workers import a metric by its name, and {settings[name].rpartition(':')[2]} has none "
@@ -92,9 +91,10 @@ def check_shared(settings: Mapping[str, str]) -> None:
 
 def load_metrics(settings: Mapping[str, str], given: Mapping[str, str | Metric] | None = None) -> Metrics:
     """Return the functions that settings name; `given` ones are there already, and take their place."""
-    functions: dict[str, Any] = {name: one for name, one in (given or {}).items() if name in settings and callable(one)}
+    functions: dict[str, Any] = {}
     for name, text in settings.items():
-        if name in functions:
+        functions[name] = (given or {}).get(name)
+        if callable(functions[name]):
             continue
         module, colon, attribute = text.partition(":")
         if not colon or not attribute:
@@ -111,7 +111,7 @@ def load_metrics(settings: Mapping[str, str], given: Mapping[str, str | Metric] 
         if not callable(functions[name]):
             got = f"{functions[name]!r:.80}"
             raise InputError(f"metrics: {name}: expected a function of (image, output, truth), got {got}")
-    return {name: functions[name] for name in settings}
+    return functions
 
 
 def judgements(
@@ -142,22 +142,19 @@ def with_things(judgement: Judgement, things: JsonObject | None) -> Judgement:
 def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Output, truth: Truth) -> Judgement:
     """Return the judgement of a picture (H, W, 3), sRGB in [0, 1], with what metrics say of it. A metric gets the truth
     as an objective does, of one picture; all that it gets are copies."""
-    if not metrics:
-        return judgement
-    said, numbers = dict[str, Any](), dict[str, float | None]()
+    returned, numbers = dict[str, Any](), dict[str, float | None]()
     seen, right = _of_one(output, truth)
     with torch.no_grad():
         for name, metric in metrics.items():
             value = metric(*copied((image.detach(), seen, right)))
-            values = {f"{name}.{key}": each for key, each in value.items()} if isinstance(value, Mapping) else None
-            said |= {name: value} if values is None else values
-        for name, value in said.items():
+            several = value if isinstance(value, Mapping) else {}
+            returned |= {f"{name}.{key}": each for key, each in several.items()} if several is value else {name: value}
+        for name, value in returned.items():
             try:
                 number = float(value)
             except (TypeError, ValueError, RuntimeError):
-                raise InputError(
-                    f"metrics: {name}: expected a number, or a dict from names to numbers, got {value!r:.80}"
-                ) from None
+                expected = "a number, or a dict from names to numbers"
+                raise InputError(f"metrics: {name}: expected {expected}, got {value!r:.80}") from None
             numbers[name] = number if math.isfinite(number) else None
     return replace(judgement, metrics=numbers)
 
@@ -237,87 +234,19 @@ def one_label_for_several(models: Sequence[Model], label: str | None, objects: M
     if label is None or len(objects) < 2:
         return []
 
-    def differ(own: str) -> bool:
-        """Whether a model has classes for both labels, and none in common."""
-        for model in models:
-            try:
-                known = set(model.label_set(own).indices)
-            except InputError:
-                continue
-            if not known & set(model.label_set(label).indices):
-                return True
-        return False
-
-    others = [f"{name} (its own is {own!r})" for name, own in objects.items() if own and differ(own)]
+    others = dict[str, str]()
+    for (name, own), model in product(objects.items(), models):
+        known = set[int]()
+        with suppress(InputError):  # where no class is called so
+            known |= set(model.label_set(own).indices if own else ())
+        if known and not known & set(model.label_set(label).indices):
+            others[name] = f"{name} (its own is {own!r})"
     if not others:
         return []
     return [
-        f"The label {label!r} is taken as the right label for every object, also for {', '.join(others)}; without a "
-        "label, each object has its own."
+        f"The label {label!r} is taken as the right label for every object, also for {', '.join(others.values())}; "
+        "without a label, each object has its own."
     ]
-
-
-MOST_NUMBERS, MOST = 64, 512
-"""Numbers, beside base colours, of a configuration whose truth is remembered; and truths that are."""
-
-
-def _keep(kept: dict[bytes, Any], key: bytes, value: Any) -> None:
-    """Remember a value in place of the oldest ones."""
-    while len(kept) >= MOST:
-        del kept[next(iter(kept))]
-    kept[key] = value
-
-
-@dataclass
-class KnownTruths:
-    """What is true of configurations; `facts` come from what describes one and what looks at it."""
-
-    task: Task
-    space: Space
-    renderer: Renderer
-    facts: Callable[[Described, Looked], Facts]
-    _kept: dict[bytes, Truth] = field(default_factory=dict)
-    _seen: dict[bytes, JsonObject | None] = field(default_factory=dict)
-
-    def at(self, whole: Tensor, listed: Mapping[str, Value] | None = None) -> Truth:
-        """Return what is true at (d,) of the whole space. Values that are `listed` count as they are there, not as what
-        single precision makes of them."""
-        # what the camera sees first has nothing to do with base colours, so that a truth is remembered where the rest
-        # is a few numbers, unless the task asks for numbers
-        rest = whole.detach()[self._rest]
-        key = rest.numpy().tobytes()
-        if not listed and key in self._kept:
-            return self._kept[key]
-
-        def values() -> dict[str, Value]:
-            return {name: (listed or {}).get(name, value) for name, value in self.space.describe(whole).items()}
-
-        facts = self.facts(values, lambda: self.renderer.surfaces(whole))
-        if rig := () if self.space.scene is None else self.space.scene.rig:
-            looks = [partial(self.renderer.surfaces, whole, camera=number) for number in range(len(rig))]
-            facts = replace(facts, views=tuple(self.facts(values, look) for look in looks))
-        truth = self.task.truth(facts)
-        if not listed and len(rest) <= MOST_NUMBERS and "numbers" not in vars(facts):
-            _keep(self._kept, key, truth)
-        return truth
-
-    def things(self, whole: Tensor) -> JsonObject | None:
-        """Return what the picture at (d,) of the whole space shows of each thing, see `things_seen`."""
-        if self.space.scene is None or not self.space.scene.things:
-            return None
-        key = whole.detach()[self._rest].numpy().tobytes()
-        if key not in self._seen:
-            _keep(self._seen, key, things_seen(self.renderer, whole))
-        return self._seen[key]
-
-    @cached_property
-    def _rest(self) -> Tensor:
-        """Which coordinates do more than to colour surfaces, (d,) bool."""
-        linear, rest = linear_inputs(self.renderer), torch.ones(len(self.space.start), dtype=torch.bool)
-        for group in self.space.groups:
-            route = self.renderer.routes.get(group.name)
-            rest[group.coordinates] = not route or not route <= linear
-        return rest
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -332,16 +261,12 @@ def domain_of(controls: Sequence[Control], start: Tensor | None = None, **more: 
     `start` (d,) or the controls' own, which leaves the scene as it is; with `more` fields of `Domain`."""
     blocks = tuple(
         Block(
-            group.size,
-            group.budget.norm,  # type: ignore[arg-type]
-            group.budget.epsilon,
-            periodic=group.periodic,
-            name=f"{control.name}.{group.parameter}",
-            options=group.options,
+            group.size, group.budget.norm, group.budget.epsilon,  # type: ignore[arg-type]
+            periodic=group.periodic, name=f"{control.name}.{group.parameter}", options=group.options,
         )
         for control in controls
         for group in control.groups
-    )
+    )  # fmt: skip
     if start is None:
         start = torch.cat([control.start for control in controls]) if controls else torch.zeros(0)
     return Domain(start, blocks, **more)
@@ -446,7 +371,6 @@ def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def print_terms(space: Space, u: Tensor) -> PrintTerms:
-    """Return both terms of a configuration (d,), without their weight."""
     with torch.no_grad():
         rough, off = _terms(space, u)
     return PrintTerms(variation=float(rough), off_print=float(off))

@@ -52,7 +52,6 @@ its instance, and ``mitsuba:KEY`` a range."""
 Texture = str | Path | npt.ArrayLike | Tensor
 
 CONTROL, SCENE, MODEL = "control", "scene", "model"  # kinds of things that may stand for a name (`lent`)
-
 DEFAULT_RESOLUTION = 128
 
 
@@ -71,15 +70,9 @@ class Scene:
 
     @names_code
     def renderer(
-        self,
-        controls: Controls,
-        *,
-        resolution: int | tuple[int, int] = DEFAULT_RESOLUTION,
-        denoise: str = "oidn",
-        seed: int = 0,
-        estimators: Mapping[str, str] | None = None,
-        sampler: str = SAMPLER,
-    ) -> Renderer:
+        self, controls: Controls, *, resolution: int | tuple[int, int] = DEFAULT_RESOLUTION, denoise: str = "oidn",
+        seed: int = 0, estimators: Mapping[str, str] | None = None, sampler: str = SAMPLER,
+    ) -> Renderer:  # fmt: skip
         """Return `render(u, seed, spp)` for the space of these controls.
 
         Args:
@@ -126,7 +119,20 @@ class Scene:
     def with_texture(self, texture: Texture) -> Scene:
         """Return the scene with another texture of the object; see `load_scene`. Raises FileFormatError (the file is no
         picture), or InputError: it is no (h, w, 3) picture in [0, 1]."""
-        painted = replace(self.description.object, base_color=_texels(texture))
+        if isinstance(texture, (str, Path)):
+            texels = read_picture(Path(texture), None)
+        else:
+            array = np.asarray(texture.detach().cpu() if isinstance(texture, Tensor) else texture)
+            numbers: Floats = array.astype(np.float32) / (255.0 if array.dtype == np.uint8 else 1.0)
+            if numbers.ndim != 3 or numbers.shape[2] != 3 or not numbers.size:
+                raise InputError(f"texture: expected a picture (h, w, 3), got an array of shape {array.shape}")
+            if not (np.isfinite(numbers).all() and numbers.min() >= 0.0 and numbers.max() <= 1.0):
+                raise InputError(
+                    f"texture: expected sRGB in [0, 1], or 8 bits as uint8, got {array.dtype} from {array.min():g} to "
+                    f"{array.max():g}"
+                )
+            texels = np.ascontiguousarray(numbers)
+        painted = replace(self.description.object, base_color=texels)
         return Scene(replace(self.description, object=painted), only_here=True)
 
     def with_settings(self, given: Given) -> Scene:
@@ -146,18 +152,11 @@ class Scene:
 @helped
 @plainly()
 def load_scene(
-    object: str | Path | ObjectAsset,
-    environment: str | Path | EnvironmentAsset | None = None,
-    *,
-    scene: str | Path | Mapping[str, object] | None = None,
-    up: str | None = None,
-    size: float | None = None,
-    unit: str | None = None,
-    settings: Given | None = None,
-    camera: str | None = None,
-    texture: Texture | None = None,
+    object: str | Path | ObjectAsset, environment: str | Path | EnvironmentAsset | None = None, *,
+    scene: str | Path | Mapping[str, object] | None = None, up: str | None = None, size: float | None = None,
+    unit: str | None = None, settings: Given | None = None, camera: str | None = None, texture: Texture | None = None,
     things: str | Mapping[str, object] | Sequence[str | Mapping[str, object]] | None = None,
-) -> Scene:
+) -> Scene:  # fmt: skip
     """Load a scene.
 
     Args:
@@ -188,58 +187,28 @@ def load_scene(
         raise InputError(f"object: expected the name of a node or shape of the scene, got {object!r}")
     plugins = scene if isinstance(scene, Mapping) else None
     described = describe(
-        object if scene is None or plugins is not None else f"{scene}#{object}",
-        environment,
-        given=None if settings is None else as_python(settings),
-        up=up,
-        size=size,
-        unit=unit,
-        plugins=plugins,
+        object if scene is None or plugins is not None else f"{scene}#{object}", environment, up=up, size=size,
+        given=None if settings is None else as_python(settings), unit=unit, plugins=plugins,
         things=things_as_text(things),
-    )
+    )  # fmt: skip
     named = all(given is None or isinstance(given, (str, Path)) for given in (object, environment))
     only_here = plugins is not None or not named
     loaded = Scene(described if camera is None else described.seen_by(camera), only_here)
     return loaded if texture is None else loaded.with_texture(texture)
 
 
-def _texels(texture: Texture) -> Floats:
-    """A texture as an object has it: (h, w, 3) float32 sRGB in [0, 1]."""
-    if isinstance(texture, (str, Path)):
-        return read_picture(Path(texture), None)
-    given = np.asarray(texture.detach().cpu() if isinstance(texture, Tensor) else texture)
-    texels: Floats = given.astype(np.float32) / (255.0 if given.dtype == np.uint8 else 1.0)
-    if texels.ndim != 3 or texels.shape[2] != 3 or not texels.size:
-        raise InputError(f"texture: expected a picture (h, w, 3), got an array of shape {given.shape}")
-    if not (np.isfinite(texels).all() and texels.min() >= 0.0 and texels.max() <= 1.0):
-        raise InputError(
-            f"texture: expected sRGB in [0, 1], or 8 bits as uint8, got {given.dtype} from {given.min():g} to "
-            f"{given.max():g}"
-        )
-    return np.ascontiguousarray(texels)
-
-
 def scene_as_settings(scene: Scene) -> dict[str, Any]:
-    """Return the settings that say what a scene is, as far as settings can."""
-    described = scene.description
+    own = scene.description
+    model, turned = own.camera_model, own.camera == ORBIT_CAMERA
+    named = own.preset or (model.name if model is not None else "") or (None if turned else own.camera)
     return {
-        "object": described.object_name,
-        "environment": described.environment_name,
-        "up": described.up,
-        "size": described.size,
-        "unit": described.unit,
-        "camera": named_camera(described),
-        "things": described.things_spec or None,
-        "set": described.given_values,
+        "object": own.object_name,
+        "environment": own.environment_name,
+        **{name: getattr(own, name) for name in ("up", "size", "unit")},
+        "camera": own.rig_spec if own.rig else named,
+        "things": own.things_spec or None,
+        "set": own.given_values,
     }
-
-
-def named_camera(description: SceneDescription) -> str | None:
-    """Return the camera in use, as `load_scene` takes it; None for the pinhole around the object."""
-    if description.rig:
-        return description.rig_spec
-    model, turned = description.camera_model, description.camera == ORBIT_CAMERA
-    return description.preset or (model.name if model is not None else "") or (None if turned else description.camera)
 
 
 def framed(description: SceneDescription, resolution: int | tuple[int, int]) -> SceneDescription:
@@ -258,17 +227,10 @@ def framed(description: SceneDescription, resolution: int | tuple[int, int]) -> 
 
 
 def make_renderer(
-    description: SceneDescription,
-    space: Space,
-    resolution: int | tuple[int, int],
-    denoise: str,
-    seed: int,
-    estimators: Mapping[str, str] | None = None,
-    leave_out: Collection[str] = EVERYTHING,
-    sampler: str = SAMPLER,
-    *,
+    description: SceneDescription, space: Space, resolution: int | tuple[int, int], denoise: str, seed: int,
+    estimators: Mapping[str, str] | None = None, leave_out: Collection[str] = EVERYTHING, sampler: str = SAMPLER, *,
     differentiated: bool = True,
-) -> Renderer:
+) -> Renderer:  # fmt: skip
     """Put a described scene, with what the space's controls need in it, into Mitsuba at one size.
 
     How fast coordinates move outlines is measured only where pictures are differentiated with respect to them: it takes
@@ -281,10 +243,8 @@ def make_renderer(
             "environment: the scene has neither a map nor a lamp, so that every picture is black; give it one of the "
             "two, such as `controls=light`"
         )
-    exposure = description.number("camera.exposure")
-    formation = ImageFormation(
-        denoiser=denoise, sampler=sampler, exposure=exposure, resolution=size, gain=description.gain
-    )
+    exposure, gain = description.number("camera.exposure"), description.gain
+    formation = ImageFormation(denoiser=denoise, sampler=sampler, exposure=exposure, resolution=size, gain=gain)
     scene = MitsubaScene(description, size, filter=formation.filter, leave_out=leave_out, sampler=sampler)
     exposed = any(space.exposure)
     if any(mount.later for mount in description.rig):
@@ -347,51 +307,38 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
 
 def controls_by_name(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
     """Return instances and settings by name, in the order in which they were given."""
+    asked: dict[str, object] = {}
     if isinstance(controls, Mapping):
-        asked = {name: _plain(given) for name, given in controls.items()}
-        for name, given in asked.items():
+        for name, given in controls.items():
             if isinstance(given, type) or (isinstance(given, Control) and given.name != name):
                 got = f"one that is called {given.name}" if isinstance(given, Control) else told(given)
                 raise InputError(
                     f"`controls` {name}: expected settings, or an instance of that name, got {got}; instances stand in "
                     "a list as well, controls=[...]"
                 )
+            if isinstance(given, Mapping) and not given.keys() & {"distribution", "choices", "range"}:
+                asked[name] = {key: as_setting(value) for key, value in given.items()}
+            else:
+                asked[name] = given if isinstance(given, Control) else as_setting(given)
     else:
-        asked = _listed(controls)
+        listed: Iterable[object] = controls if isinstance(controls, Iterable) else [controls]
+        for control in [controls] if isinstance(controls, (str, Control)) else listed:
+            if not isinstance(control, (str, Control)):
+                raise InputError(f"controls: expected names or Control instances, got {told(control)}")
+            named = read_controls([control], "controls") if isinstance(control, str) else {control.name: control}
+            for name in named:
+                if name in asked:
+                    raise InputError(
+                        f"controls: every instance needs a name of its own, got {name} twice; write KIND:NAME, such as "
+                        "light:key,light:fill"
+                    )
+            asked |= named
     ready = {name: given for name, given in asked.items() if isinstance(given, Control)}
-    named = settings_by_name({**asked, **dict.fromkeys(ready)})
-    return {name: ready.get(name, said) for name, said in named.items()}
-
-
-def _plain(given: object) -> object:
-    """What was given for one control, or one parameter of one, with distributions as settings have them."""
-    if isinstance(given, (Control, type)):
-        return given
-    if isinstance(given, Mapping) and not given.keys() & {"distribution", "choices", "range"}:
-        return {key: as_setting(value) for key, value in given.items()}
-    return as_setting(given)
-
-
-def _listed(controls: str | Control | Iterable[object]) -> dict[str, object]:
-    """Return controls that were given in a list or a text, by name: an instance, or what the text says of it."""
-    several = [controls] if isinstance(controls, (str, Control)) or not isinstance(controls, Iterable) else controls
-    listed: dict[str, object] = {}
-    for control in several:
-        if not isinstance(control, (str, Control)):
-            raise InputError(f"controls: expected names or Control instances, got {told(control)}")
-        named = read_controls([control], "controls") if isinstance(control, str) else {control.name: control}
-        for name, given in named.items():
-            if name in listed:
-                raise InputError(
-                    f"controls: every instance needs a name of its own, got {name} twice; write KIND:NAME, such as "
-                    "light:key,light:fill"
-                )
-            listed[name] = given
-    return listed
+    settings = settings_by_name({**asked, **dict.fromkeys(ready)})
+    return {name: ready.get(name, given) for name, given in settings.items()}
 
 
 def instances_in(controls: object) -> list[Control]:
-    """Return the instances among controls."""
     listed = controls.values() if isinstance(controls, Mapping) else controls
     listed = listed if isinstance(listed, (list, tuple, ValuesView)) else [listed]
     return [control for control in listed if isinstance(control, Control)]
@@ -406,7 +353,6 @@ def lent(kind: str, name: str) -> Any:
 
 
 def all_lent(kind: str) -> list[Any]:
-    """Return everything of a kind that stands for a name."""
     return [one for (of, _), one in _LENT.get().items() if of == kind]
 
 

@@ -37,7 +37,6 @@ def scene_of(config: SceneConfig, name: str | None = None, environment: str | No
 
 
 def told_of_scene(config: SceneConfig) -> dict[str, Any]:
-    """Return what `load_scene` is told beside object and environment."""
     names = ("up", "size", "unit", "camera", "things")
     return {**{name: getattr(config, name) for name in names}, "settings": scene_settings(config)}
 
@@ -79,10 +78,11 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ModelWarning)
-        loaded = tuple(map(load, asked, parts))
-    sentences = [str(warning.message) for warning in caught if issubclass(warning.category, ModelWarning)]
+        loaded, sentences = tuple(map(load, asked, parts)), list[str]()
     for warning in caught:
-        if not issubclass(warning.category, ModelWarning):
+        if issubclass(warning.category, ModelWarning):
+            sentences.append(str(warning.message))
+        else:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
     if rig := () if config.camera is None else read_rig(config.camera):
         if not isinstance(task, Rig):
@@ -110,7 +110,6 @@ def several(models: AnyModel | Sequence[AnyModel]) -> list[AnyModel]:
 
 
 def model_name(model: AnyModel) -> str:
-    """Return what a model is called in settings."""
     if isinstance(model, (str, Path)):
         return str(model)
     return str(getattr(model, "asked", None) or getattr(model, "name", None) or type(model).__name__)
@@ -142,7 +141,6 @@ def check_not_of_scene(settings: Mapping[str, object]) -> None:
 
 
 def check_not_spread(settings: Mapping[str, object]) -> None:
-    """Refuse to share work on what is loaded already."""
     for name in ("workers", "cluster"):
         if settings.get(name) is not None:
             raise InputError(
@@ -171,11 +169,10 @@ def given_to(config: SceneConfig, controls: Controls) -> tuple[Control, ...]:
                 )
         ready[name] = given
         if not isinstance(given, Control):
-            _, own_name = names_of(name, given)
             taken = {}
             for choice in _choices(name, given) or ():
                 value = getattr(config, choice.run_setting, None)
-                value = value.get(own_name) if isinstance(value, Mapping) else value
+                value = value.get(names_of(name, given)[1]) if isinstance(value, Mapping) else value
                 if value is not None and not isinstance(value, tuple):  # each run of a curve has its own epsilon
                     taken[choice.name] = value
             ready[name] = {**taken, **given}
@@ -202,17 +199,16 @@ def check_run_settings(config: SceneConfig) -> None:
             continue
         drawn = {} if setting == "epsilon" else getattr(config, "over", {})
         asked = gathered({**config.controls, **drawn})
+        without = {name: names_of(name, given)[0] for name, given in asked.items() if not takes(name, given, setting)}
         if isinstance(value, Mapping):
             known = {names_of(name, given)[1]: name for name, given in asked.items()}
             for name in value:
                 if name not in known:
                     raise UnknownNameError(f"control in `{setting}`", name, known)
-                if not takes(known[name], asked[known[name]], setting):
-                    raise _not_taken(setting, name, names_of(known[name], asked[known[name]])[0])
-            continue
-        without = [name for name, given in asked.items() if not takes(name, given, setting)]
-        if without and (isinstance(value, tuple) or len(without) == len(asked)):
-            raise _not_taken(setting, without[0], names_of(without[0], asked[without[0]])[0])
+                if known[name] in without:
+                    raise _not_taken(setting, name, without[known[name]])
+        elif without and (isinstance(value, tuple) or len(without) == len(asked)):
+            raise _not_taken(setting, *next(iter(without.items())))
 
 
 def takes(asked: str, given: Mapping[str, object], setting: str) -> bool:
@@ -230,15 +226,11 @@ def _choices(asked: str, given: Mapping[str, object]) -> list[Choice] | None:
 
 def _counting(kind: type[Control], given: Mapping[str, object]) -> list[Choice]:
     """The choices that count beside the settings that are given: what they are about is searched."""
-
-    def searched(name: str) -> bool:
-        if any(choice.fixes == name and given.get(choice.name) is not None for choice in kind.choices):
-            return False
-        if given.get(name) is not None:
-            return not is_number(given[name])
-        return any(parameter.name == name and parameter.search is not None for parameter in kind.parameters)
-
-    return [choice for choice in kind.choices if not choice.bounds or searched(choice.bounds)]
+    fixed = {choice.fixes for choice in kind.choices if given.get(choice.name) is not None}
+    searched = {parameter.name for parameter in kind.parameters if parameter.search is not None}
+    searched |= {name for name, value in given.items() if value is not None}
+    searched -= fixed | {name for name, value in given.items() if is_number(value)}
+    return [choice for choice in kind.choices if not choice.bounds or choice.bounds in searched]
 
 
 def _not_taken(setting: str, name: str, kind: str) -> InputError:

@@ -9,14 +9,12 @@ import math
 import statistics
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.engine.gradients import Keep, Loss, gradients, measured_now, only
+from advsearch.engine.gradients import Bench, only
 from advsearch.engine.problem import Problem
 from advsearch.runs.results import GradientStatus, Measured, PathCut, PathLength
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, Group, compared
@@ -66,27 +64,14 @@ REPEATS = 3  # gradients that are taken of everything that is compared
 
 
 def plan_gradients(plan: GradientPlan, *, every: bool = False) -> int:
-    """Return how many gradients `measured_plan` takes."""
     return REPEATS * sum(len(candidates) for _, candidates in contested(plan, every=every))
 
 
-def measured_plan(
-    renderer: Renderer,
-    loss: Loss,
-    u: Tensor,
-    *,
-    seed: int,
-    spp: int,
-    repeats: int = REPEATS,
-    every: bool = False,
-    counted: bool = False,
-    tick: Callable[[], None] = lambda: None,
-    keep: Keep = measured_now,
-) -> GradientPlan:
-    """Return the renderer's plan, which is not changed, with every contested choice made by measurement at u. If
-    `counted`, the renders that an estimator needs stand for its time (`ADJOINT_RENDERS` for an adjoint), so that the
-    choice is the same on a busy machine."""
-    plan = renderer.plan
+def measured_plan(bench: Bench, *, repeats: int = REPEATS, every: bool = False, counted: bool = False) -> GradientPlan:
+    """Return the renderer's plan, which is not changed, with every contested choice made by measurement. If `counted`,
+    the renders that an estimator needs stand for its time (`ADJOINT_RENDERS` for an adjoint), so that the choice is the
+    same on a busy machine."""
+    plan = bench.renderer.plan
 
     def scores_of(groups: Sequence[Group], candidates: Sequence[str]) -> dict[str, float]:
         """Squared error x seconds. The reference is the mean of the differences among the candidates, whose own noise
@@ -94,29 +79,29 @@ def measured_plan(
         measured, seconds, noise = dict[str, Tensor](), dict[str, float](), dict[str, float]()
         for estimator in candidates:
             alone = only(plan, {group.name for group in groups}, estimator)
-            how: dict[str, Any] = {"seed": seed, "spp": spp, "repeats": repeats, "keep": keep, "tick": tick}
-            how["place"] = f"{groups[0].name} by {estimator}"
-            several, seconds[estimator] = gradients(renderer, loss, u, alone, "plan", **how)
+            place = f"{groups[0].name} by {estimator}"
+            several, seconds[estimator] = bench.gradients(alone, "plan", repeats, place)
             if counted:
                 seconds[estimator] = 1.0 + alone.renders + (ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0)
             measured[estimator] = several
             noise[estimator] = float((several - several.mean(dim=0)).square().sum() / max(1, repeats - 1))
         judge = next(estimator for estimator in candidates if estimator in BY_DIFFERENCES)
-        errors, truth = dict[str, float](), measured[judge].mean(dim=0)
+        scores, truth = dict[str, float](), measured[judge].mean(dim=0)
         for estimator, several in measured.items():
             error = float((several - truth).square().sum(dim=1).mean()) - noise[judge] / repeats
-            errors[estimator] = noise[judge] if estimator == judge else max(error, noise[estimator])
-        return {estimator: error * seconds[estimator] for estimator, error in errors.items()}
+            error = noise[judge] if estimator == judge else max(error, noise[estimator])
+            scores[estimator] = error * seconds[estimator]
+        return scores
 
     for groups, candidates in contested(plan, every=every):
         scores = scores_of(groups, candidates)
         best = min(scores, key=lambda name: scores[name])
-        reason = f"least squared error x {'renders' if counted else 'time'}, measured at {spp} samples"
+        reason = f"least squared error x {'renders' if counted else 'time'}, measured at {bench.spp} samples"
         if scores[best] > 0.0:
             others = ", ".join(f"{name} {score / scores[best]:.3g}" for name, score in scores.items() if name != best)
             reason += f" (others, as multiples of it: {others})"
         elif not any(scores.values()):  # a loss that is flat here, as of a detector that sees nothing
-            reason = f"as preferred: none of them has an error, measured at {spp} samples"
+            reason = f"as preferred: none of them has an error, measured at {bench.spp} samples"
         chosen = {group.name: replace(group, estimator=best, reason=reason, measured=scores) for group in groups}
         plan = replace(plan, groups=tuple(chosen.get(group.name, group) for group in plan.groups))
     return plan
@@ -137,32 +122,20 @@ def _controls_of(plan: GradientPlan) -> list[tuple[list[Group], Sequence[float]]
     return [(groups, FACTORS if steps else FACTORS[:1]) for groups, steps in zip(controls, by_steps, strict=True)]
 
 
-def cosines(
-    renderer: Renderer,
-    loss: Loss,
-    u: Tensor,
-    *,
-    seed: int,
-    counts: Sequence[int] = COUNTS,
-    tick: Callable[[int], None] = lambda samples: None,
-    keep: Keep = measured_now,
-) -> Iterator[Measured]:
+def cosines(bench: Bench, *, counts: Sequence[int] = COUNTS) -> Iterator[Measured]:
     """Measure, control by control, the cosine of working gradients with the converged one at the same step.
 
-    Sample counts are tried in their order until one reaches the goal at a step; then the next step follows. `tick` is
-    called after each gradient with the samples a pixel that it took; `cosine_samples` bounds their sum. `keep` is asked
-    for each gradient, by a name.
+    Sample counts are tried in their order until one reaches the goal at a step; then the next step follows.
+    `cosine_samples` bounds the samples of all gradients.
     """
-    base, taken = renderer.plan, partial(gradients, renderer, loss, u, seed=seed, keep=keep)
+    base = bench.renderer.plan
 
     def rows_at(plan: GradientPlan, groups: Sequence[Group], factor: float) -> Iterator[Measured]:
-        """Those of a control, at one step."""
         control, estimators = groups[0].control, ", ".join(dict.fromkeys(group.estimator for group in groups))
         place = f"{control} x {factor:g}"
 
         def converged(spp: int) -> tuple[Tensor, float]:
-            named = f"{place} converged {spp}"
-            several, _ = taken(plan, "converged", spp=spp, repeats=WITNESSES, place=named, tick=partial(tick, spp))
+            several, _ = replace(bench, spp=spp).gradients(plan, "converged", WITNESSES, f"{place} converged {spp}")
             agreements = torch.tensor([_cosine(*pair) for pair in itertools.combinations(several, 2)])
             return several.mean(dim=0), float(agreements.min())  # NaN if one is
 
@@ -172,21 +145,12 @@ def cosines(
             if many == CONVERGED and (agreement < GOAL or spp > CONVERGED):
                 many = AGAIN * CONVERGED
                 truth, agreement = converged(many)
-            how: dict[str, Any] = {"spp": spp, "place": f"{place} {spp}", "tick": partial(tick, spp)}
-            several, seconds = taken(plan, "working", repeats=REPEATS, **how)
+            several, seconds = replace(bench, spp=spp).gradients(plan, "working", REPEATS, f"{place} {spp}")
             mean = statistics.fmean(_cosine(gradient, truth) for gradient in several)
             yield Measured(
-                quantity="gradient",
-                control=control,
-                estimator=estimators,
-                factor=factor,
-                spp=spp,
-                repeats=REPEATS,
-                cosine=mean,
-                reference_cosine=agreement,
-                seconds=seconds,
-                status=status_of(mean, agreement),
-            )
+                quantity="gradient", control=control, estimator=estimators, factor=factor, spp=spp, repeats=REPEATS,
+                cosine=mean, reference_cosine=agreement, seconds=seconds, status=status_of(mean, agreement),
+            )  # fmt: skip
             if mean >= GOAL:
                 break
 
@@ -238,18 +202,12 @@ def tuned(plan: GradientPlan, table: Sequence[Measured]) -> tuple[GradientPlan, 
 
 SHORTEST = 2  # segments of the shortest path tried: light that reaches the camera from a surface that it falls on
 BOUND = 0.5  # root-mean-square change of the displayed picture, in 8-bit levels, that a search accepts
-LEVELS = 255.0
 
 
 def measured_bounces(
-    renderer: Renderer,
-    configurations: Sequence[Tensor],
-    *,
-    seed: int,
-    spp: int,
-    bound: float = BOUND,
+    renderer: Renderer, configurations: Sequence[Tensor], *, seed: int, spp: int, bound: float = BOUND,
     tick: Callable[[], None] = lambda: None,
-) -> PathLength:
+) -> PathLength:  # fmt: skip
     """Return the shortest paths whose pictures agree with those of the full length to within a bound, all with the same
     noise; and what was measured, from the full length downwards to the first that misses the bound."""
     raw = renderer.like(denoiser="none")  # a denoiser would spread a change over its neighbours
@@ -257,7 +215,6 @@ def measured_bounces(
     noises = [seeds.stream(seed, "half", half) for half in range(2)]
 
     def pictures(u: Tensor, depth: int) -> list[tuple[Tensor, Tensor]]:
-        """Radiance and pictures by both noises."""
         rendered = []
         for noise in noises:
             with torch.no_grad(), raw.scene.shorter(depth):
@@ -277,7 +234,7 @@ def measured_bounces(
             bias = float((first * second).mean().clamp_min(0.0).sqrt())
             all_of_it, left = (sum(float(radiance.mean()) for radiance, _ in both) for both in (whole, shorter))
             light = max(light, 1.0 - left / all_of_it if all_of_it > 0.0 else 0.0)
-            levels = max(levels, LEVELS * bias)
+            levels = max(levels, 255.0 * bias)
         cuts.append(PathCut(depth=depth, light=light, levels=levels))
         if not levels <= bound:
             break
@@ -301,7 +258,6 @@ WORTH_BOUNCES = 200  # renders of a search from which the measurement pays; each
 
 
 def most_pictures(problem: Problem) -> int:
-    """Return how many pictures `bounces_of` renders at most."""
     return (1 + DRAWS) * 2 * (1 + problem.renderer.scene.max_depth - SHORTEST)
 
 

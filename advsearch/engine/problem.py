@@ -25,7 +25,6 @@ from advsearch.engine.acceptance import ComparedView, view_of
 from advsearch.engine.judging import (
     ConfigurationInputs,
     Described,
-    KnownTruths,
     Looked,
     Metrics,
     domain_of,
@@ -33,12 +32,14 @@ from advsearch.engine.judging import (
     mean_metrics,
     with_things,
 )
+from advsearch.engine.rendering import looks_at, things_seen
+from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.runs.results import GroupDerivative, PlannedGradient
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import NO_MAP
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.gradients import GradientPlan, Group
+from advsearch.scene.gradients import GradientPlan
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import Linearised, LinearRenderer, linear_inputs
 from advsearch.tasks import Facts, Judgement, Mark, Prediction, Task
@@ -57,52 +58,46 @@ LIGHT_DEPTH = 4
 """Segments of the longest path of light that is collected under one of many conditions: many with some noise and
 without the last light teach more than few that are right."""
 
+MOST_NUMBERS, MOST = 64, 512
+"""Numbers, beside base colours, of a configuration whose truth is remembered; and truths that are."""
+
+
+def _keep(kept: dict[bytes, Any], key: bytes, value: Any) -> None:
+    while len(kept) >= MOST:  # the oldest ones make room
+        del kept[next(iter(kept))]
+    kept[key] = value
+
+
 BY_CHANCE = "forced: it varies by chance, so nobody asks for its derivative"
 
 
 @dataclass
 class Problem:
-    """The joint of rendering, model and search.
+    """The joint of rendering, model and search."""
 
-    Attributes:
-        renderer: `render(u, seed, spp)` of the whole space.
-        space: the controls behind the whole of u: those that are searched, then those that vary by chance.
-        task: judges the model's output; says what counts as success.
-        facts: what the scene gives it to judge by, from what describes the configuration and what looks at it.
-        objective: what is maximised; None of a sweep.
-        spp: samples a pixel while searching.
-        searched: how many of the controls are searched; None for all. The others are the conditions: drawn anew from
-            their whole range for every picture.
-        steps: renders of a search.
-        draws: conditions that one evaluation looks at, where there are any; the objective is their mean.
-        search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
-            renders the scene's.
-        metrics: numbers of every picture that rows have beside what the task says.
-        aovs: layers of ground truth that are kept of the clean scene and the adversarial scene (`scene.surfaces.AOVS`).
-        domain: where a search may look: the searched controls.
-        conditions: where the others are drawn from; None where there are none.
-    """
-
-    renderer: Renderer
-    space: Space
+    renderer: Renderer  # `render(u, seed, spp)` of the whole space
+    space: Space  # the controls behind the whole of u: those that are searched, then those that vary by chance
     model: Model
-    task: Task
-    facts: Callable[[Described, Looked], Facts]
-    objective: Objective | None
-    spp: int
+    task: Task  # judges the model's output; says what counts as success
+    facts: Callable[[Described, Looked], Facts]  # what it judges by, from what describes and what sees a configuration
+    objective: Objective | None  # what is maximised; None of a sweep
+    spp: int  # samples a pixel while searching
     seed: int
+    # how many of the controls are searched, None for all; the others are the conditions, which are drawn anew from
+    # their whole range for every picture
     searched: int | None = None
-    steps: int = 0
-    draws: int = 1
-    search_depth: int | None = None
-    aovs: tuple[str, ...] = ()
-    metrics: Metrics = field(default_factory=dict)
-    domain: Domain = field(init=False)
-    conditions: Domain | None = field(init=False)
+    steps: int = 0  # renders of a search
+    draws: int = 1  # conditions that one evaluation looks at, where there are any; the objective is their mean
+    search_depth: int | None = None  # longest light path in segments of a search's renders; None for the scene's
+    aovs: tuple[str, ...] = ()  # layers of ground truth that are kept of clean and adversarial scene (`surfaces.AOVS`)
+    metrics: Metrics = field(default_factory=dict)  # numbers of every picture beside what the task says
+    domain: Domain = field(init=False)  # where a search may look: the searched controls
+    conditions: Domain | None = field(init=False)  # where the others are drawn from; None where there are none
 
     def __post_init__(self) -> None:
         self.plan = self.renderer.plan
-        self._truths = KnownTruths(self.task, self.space, self.renderer, self.facts)
+        self._truths: dict[bytes, Truth] = {}
+        self._things: dict[bytes, JsonObject | None] = {}
 
     @property
     def plan(self) -> GradientPlan:
@@ -176,20 +171,23 @@ class Problem:
         with torch.no_grad():
             output = self.model(pictures)
             truths = [self.truth()] if not self.task.varies else list(map(self.truth, wholes, listed))
-            said = self._judged(output, pictures, truths, wholes)
-        kept = [(Judgement.of(each.score, each.margin, each.prediction, each.payload), each.metrics) for each in said]
-        return [replace(judgement, metrics=metrics) for judgement, metrics in kept]
-
-    def trial(self, shown: Tensor, whole: Tensor, /, **more: Any) -> Evaluation:
-        """Return the answer to a trial, of the picture (H, W, 3) that the model was shown, with `more` fields."""
-        return Evaluation.of(self.judge(shown, whole), **more)
+            judged = self._judged(output, pictures, truths, wholes)
+        plain = [Judgement.of(each.score, each.margin, each.prediction, each.payload) for each in judged]
+        return [replace(judgement, metrics=each.metrics) for judgement, each in zip(plain, judged, strict=True)]
 
     def _judged(
         self, output: Output, pictures: Tensor, truths: Sequence[Truth], wholes: Sequence[Tensor]
     ) -> list[Judgement]:
         """What task and metrics say of pictures (N, H, W, 3), and what these show of each thing."""
-        said = judgements(self.task, output, pictures, truths, self.metrics)
-        return [with_things(judgement, self._truths.things(at)) for judgement, at in zip(said, wholes, strict=True)]
+        judged = list(judgements(self.task, output, pictures, truths, self.metrics))
+        if self.space.scene is None or not self.space.scene.things:
+            return judged
+        for number, whole in enumerate(wholes):
+            key = whole.detach()[self._rest].numpy().tobytes()
+            if key not in self._things:
+                _keep(self._things, key, things_seen(self.renderer, whole))
+            judged[number] = with_things(judged[number], self._things[key])
+        return judged
 
     def view(
         self, predict: Callable[[Tensor], Tensor], whole: Tensor, seed: int, spp: int, *, drawn: Tensor | None = None
@@ -219,14 +217,39 @@ class Problem:
         `listed` count as they are there, not as what single precision makes of them."""
         if whole is None or not self.task.varies:
             return self._start_truth
-        return self._truths.at(whole, listed)
+        # what the camera sees first has nothing to do with base colours, so that a truth is remembered where the rest
+        # is a few numbers, unless the task asks for numbers
+        rest = whole.detach()[self._rest]
+        key = rest.numpy().tobytes()
+        if not listed and key in self._truths:
+            return self._truths[key]
+
+        def values() -> dict[str, Value]:
+            return {name: (listed or {}).get(name, value) for name, value in self.space.describe(whole).items()}
+
+        rig = () if self.space.scene is None else self.space.scene.rig
+        facts, *views = [self.facts(values, look) for look in looks_at(self.renderer, whole, len(rig))]
+        facts = replace(facts, views=tuple(views))
+        truth = self.task.truth(facts)
+        if not listed and len(rest) <= MOST_NUMBERS and "numbers" not in vars(facts):
+            _keep(self._truths, key, truth)
+        return truth
 
     @cached_property
     def _start_truth(self) -> Truth:
         start = self.whole(self.domain.start)
         if self.task.varies:
-            return self._truths.at(start)
+            return self.truth(start)
         return self.task.truth(self.facts(lambda: self.space.describe(start), lambda: self.renderer.surfaces(start)))
+
+    @cached_property
+    def _rest(self) -> Tensor:
+        """Which coordinates do more than to colour surfaces, (d,) bool."""
+        linear, rest = linear_inputs(self.renderer), torch.ones(len(self.space.start), dtype=torch.bool)
+        for group in self.space.groups:
+            route = self.renderer.routes.get(group.name)
+            rest[group.coordinates] = not route or not route <= linear
+        return rest
 
     def asked(self, *wholes: Tensor) -> ConfigurationInputs:
         """Return what gives the objective more than pictures, at configurations of the whole space."""
@@ -239,22 +262,17 @@ class Problem:
 
     def plan_summary(self, plan: GradientPlan) -> PlannedGradient:
         """Return what a result holds of a plan: what is stored of it, and each step in its parameter's unit."""
-        stored, groups = plan.to_dict(), []
-        for group, row in zip(plan.groups, stored["groups"], strict=True):
-            step, unit = self._in_unit(group) if group.step_reason else (None, "")
+        groups = []
+        for group, row in zip(plan.groups, plan.to_dict()["groups"], strict=True):
+            u, half, ends = self.whole(self.domain.start).clone(), min(group.step, 0.5), list[Value | None]()
+            for side in (0.5 - half, 0.5 + half) if group.step_reason and group.size == 1 else ():
+                u[group.coordinates] = side  # in the middle of its range
+                ends.append(self.space.describe(u).get(group.name))
+            (low, high), step, unit = ends or (None, None), None, ""
+            if low is not None and high is not None and isinstance(low["value"], (int, float)):
+                step, unit = abs(float(high["value"]) - float(low["value"])) / 2.0, low["unit"]
             groups.append(GroupDerivative(**row, step_in_unit=step, unit=unit))
         return PlannedGradient(renders_per_gradient=plan.renders, spp=plan.spp, groups=groups)
-
-    def _in_unit(self, group: Group) -> tuple[float | None, str]:
-        """The step of one number in the middle of its range, and its unit; None of what has no number of its own."""
-        u, half, ends = self.whole(self.domain.start).clone(), min(group.step, 0.5), []
-        for side in (0.5 - half, 0.5 + half):
-            u[group.coordinates] = side
-            ends.append(self.space.describe(u).get(group.name))
-        low, high = ends
-        if group.size != 1 or low is None or high is None or not isinstance(low["value"], (int, float)):
-            return None, ""
-        return abs(float(high["value"]) - float(low["value"])) / 2.0, str(low["unit"])
 
     def conditions_of(self, u: Tensor, draw: int) -> dict[str, Value]:
         """Say the conditions of a draw in named values with units; empty where there are none."""
@@ -265,8 +283,7 @@ class Problem:
     # ---- evaluations ------------------------------------------------------------------------------------------------
 
     def evaluate_all(self, queries: Sequence[Query], prepared: Prepared | None = None) -> Iterator[Evaluation]:
-        """Answer queries, each when it is asked for (see `advsearch.attacks.evaluation.Evaluate`), as another process
-        has prepared the same problem."""
+        """Answer queries, each when it is asked for, as another process has prepared the same problem."""
         if prepared is not None:
             self.spp, self.search_depth = prepared.spp, prepared.search_depth
             if self.plan != prepared.plan:
@@ -283,7 +300,7 @@ class Problem:
         elif query.phase is None:
             picture = self.picture(u, seed, query.spp, drawn=query.drawn)
             whole = self.whole(u, seed if query.drawn else None)
-            evaluation = self.trial(picture, whole, picture=picture if query.keep else None)
+            evaluation = Evaluation.of(self.judge(picture, whole), picture=picture if query.keep else None)
         elif self.conditions is None:
             evaluation = self.evaluated(query, u, seed)[0]
         else:
@@ -296,7 +313,6 @@ class Problem:
         return replace(evaluation, non_finite=lost) if lost else evaluation
 
     def _values(self, outputs: Output, pictures: Tensor, truth: Truth, asked: ConfigurationInputs) -> Tensor:
-        """The objective of pictures (N, H, W, 3), (N,)."""
         if self.objective is None:
             raise RuntimeError("a sweep has no objective")
         return self.objective(outputs, pictures, truth, asked)
@@ -344,14 +360,10 @@ class Problem:
         image, output = seen[0]
         (judgement,) = self._judged(output, image[None], [truth], [whole])
         evaluation = Evaluation(
-            objective=float(value),
-            gradient=derivative,
-            success=judgement.success,
-            non_finite=renderer.non_finite - before,
-            cost=max(1, renderer.renders - renders) * samples,
-            judgement=judgement,
+            float(value), derivative, judgement.success, renderer.non_finite - before,
+            cost=max(1, renderer.renders - renders) * samples, judgement=judgement,
             picture=to_8_bit(image) if query.keep else None,
-        )
+        )  # fmt: skip
         return evaluation, output
 
     def judged(
@@ -375,21 +387,16 @@ class Problem:
             derivative = torch.zeros_like(u) if gradient else None
             if values.requires_grad:
                 derivative = torch.autograd.grad((values * hard_first(values)).sum(), at)[0]
-        said = zip(values.detach(), self._judged(outputs, pictures, truths, wholes), each, strict=True)
-        evaluations = [
-            (Evaluation(float(value), None, judgement.success, judgement=judgement), output)
-            for value, judgement, output in said
-        ]
+        evaluations = []
+        judgements = self._judged(outputs, pictures, truths, wholes)
+        for value, judgement, output in zip(values.detach(), judgements, each, strict=True):
+            evaluations.append((Evaluation(float(value), None, judgement.success, judgement=judgement), output))
         return evaluations, derivative
 
     def mean_under(
-        self,
-        render: Callable[[slice, Tensor], Tensor],
-        wholes: Sequence[Tensor],
-        u: Tensor,
-        gradient: WhichGradient,
+        self, render: Callable[[slice, Tensor], Tensor], wholes: Sequence[Tensor], u: Tensor, gradient: WhichGradient,
         at_once: int,
-    ) -> Evaluation:
+    ) -> Evaluation:  # fmt: skip
         """Return the mean over conditions whose pictures are predicted: `render` goes from some of them and u to
         pictures (N, H, W, 3), with a graph. The model is asked about `at_once` of them at once."""
         evaluated, total = [], None
@@ -417,13 +424,12 @@ class Problem:
             with torch.no_grad():
                 judgement = self.task.judge(self.task.average(list(outputs)), self.truth())[0]
         return Evaluation(
-            objective=sum(evaluation.objective for evaluation in each) / len(each),
-            gradient=torch.stack(gradients).mean(dim=0) if gradients else gradient,
-            success=sum(evaluation.success for evaluation in each) >= OVER_CONDITIONS.share(len(each)),
-            non_finite=sum(evaluation.non_finite for evaluation in each),
-            cost=max(evaluation.cost for evaluation in each),
+            sum(evaluation.objective for evaluation in each) / len(each),
+            torch.stack(gradients).mean(dim=0) if gradients else gradient,
+            sum(evaluation.success for evaluation in each) >= OVER_CONDITIONS.share(len(each)),
+            non_finite=sum(evaluation.non_finite for evaluation in each), cost=max(one.cost for one in each),
             judgement=replace(judgement, metrics=mean_metrics(judged)),
-        )
+        )  # fmt: skip
 
     def loss(self, image: Tensor) -> Tensor:
         """The objective of a picture (H, W, 3) sRGB near the start, as a number with a graph."""

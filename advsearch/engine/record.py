@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
-from pydantic import TypeAdapter
 from torch import Tensor
 
 from advsearch.attacks import SampleCount, SearchResult, Trials, Verification, count_right
@@ -32,51 +31,31 @@ KEPT = 4  # pictures of each group of trials that are kept
 
 @dataclass
 class Findings:
-    """What is known so far; whatever is still None or empty was not reached.
+    """What is known so far; whatever is still None or empty was not reached."""
 
-    Attributes:
-        first_look: a few renders of the clean configuration at the search's sample count.
-        search, verification: what the policy claims, and what trials say of it.
-        baseline, baseline_verification: the same of the random search.
-        unprinted, unprinted_verification: the same of the policy without print terms, where the search has them.
-        sample_count: how the sample count of the verification was chosen.
-        clean: the control group's trials.
-        beaten: verification of what the policy found, where the random search's turned out worse for the model and is
-            the run's adversarial scene instead.
-        failures: verification of the first of the different failures that the policy found.
-        ambient: verification of the same picture of a projector in other ambient light, by lux.
-        average: trials of configurations drawn from the whole space.
-        pictures: of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of a run that goes on
-            only those that it made itself.
-        frames: some pictures of the search, (H, W, 3) 8-bit values in [0, 1], numpy, for the animation.
-        transport: what predicted the pictures of the searches, if anything did.
-        rendered_because: why nothing did, in words.
-        surface_refused: why matrices did and not light on surfaces, where that was tried.
-        verification_renders: renders spent on choosing the sample count and on trials.
-        predicted_trials: trials whose picture was predicted.
-    """
-
-    first_look: tuple[Judgement, ...] = ()
-    search: SearchResult | None = None
-    baseline: SearchResult | None = None
-    sample_count: SampleCount | None = None
-    clean: tuple[Judgement, ...] = ()
+    first_look: tuple[Judgement, ...] = ()  # renders of the clean configuration at the search's sample count
+    search: SearchResult | None = None  # what the policy claims; `verification` is what trials say of it
+    baseline: SearchResult | None = None  # the same of the random search
+    sample_count: SampleCount | None = None  # how that of the verification was chosen
+    clean: tuple[Judgement, ...] = ()  # the control group's trials
     verification: Verification | None = None
     baseline_verification: Verification | None = None
-    unprinted: SearchResult | None = None
+    unprinted: SearchResult | None = None  # of the policy without print terms, where the search has them
     unprinted_verification: Verification | None = None
+    # of what the policy found, where the random search's is worse for the model and the run's adversarial scene instead
     beaten: Verification | None = None
-    failures: tuple[Verification, ...] = ()
-    ambient: dict[float, Verification] = field(default_factory=dict)
-    average: tuple[Judgement, ...] = ()
+    failures: tuple[Verification, ...] = ()  # of the first of the different failures that the policy found
+    ambient: dict[float, Verification] = field(default_factory=dict)  # of a projector's picture in other light, by lux
+    average: tuple[Judgement, ...] = ()  # trials of configurations drawn from the whole space
     smallest: Bracket | None = None
+    # of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of a run that goes on only its own
     pictures: dict[tuple[str, int], Tensor] = field(default_factory=dict)
-    frames: list[Any] = field(default_factory=list)
+    frames: list[Any] = field(default_factory=list)  # of the search, (H, W, 3) 8-bit values in [0, 1], numpy
     interrupted: bool = False
-    transport: PredictedSearch | None = None
-    rendered_because: str = ""
-    surface_refused: str = ""
-    verification_renders: int = 0
+    transport: PredictedSearch | None = None  # what predicted the pictures of the searches, if anything did
+    rendered_because: str = ""  # why nothing did, in words
+    surface_refused: str = ""  # why matrices did and not light on surfaces, where that was tried
+    verification_renders: int = 0  # renders spent on choosing the sample count and on trials
     predicted_trials: int = 0
 
     @property
@@ -123,15 +102,9 @@ def lost_remarks(lost: int) -> list[str]:
 
 
 def trial_row(
-    kind: str,
-    number: int,
-    seed: int | None,
-    spp: int,
-    trial: Judgement,
-    values: Mapping[str, Value] | None = None,
-    *,
+    kind: str, number: int, seed: int | None, spp: int, trial: Judgement, values: Mapping[str, Value] | None = None, *,
     sought: bool = True,
-) -> Row:
+) -> Row:  # fmt: skip
     """Return what the store keeps of a trial; the seed is None of a picture that was predicted. There is a success only
     where a search sought some prediction."""
     objective, success = _number(trial.objective), trial.success if sought else None
@@ -140,19 +113,12 @@ def trial_row(
 
 
 def judged(row: Row, judgement: Judgement) -> Row:
-    """Return the row with what a task said of its picture."""
     prediction = judgement.prediction
     return replace(
-        row,
-        score=_number(judgement.score),
-        correct=judgement.right,
-        margin=_number(judgement.margin),
-        label=None if judgement.not_a_number else prediction.label,
-        label_index=prediction.index,
-        probability=prediction.probability,
-        payload=judgement.payload,
-        metrics=judgement.metrics or {},
-    )
+        row, score=_number(judgement.score), correct=judgement.right, margin=_number(judgement.margin),
+        label=None if judgement.not_a_number else prediction.label, label_index=prediction.index,
+        probability=prediction.probability, payload=judgement.payload, metrics=judgement.metrics or {},
+    )  # fmt: skip
 
 
 def _number(value: float | None) -> float | None:
@@ -174,18 +140,12 @@ def verified_rate(checked: Verification) -> VerifiedRate:
 
 def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]) -> VerifiedRate:
     """Return a rate with the predictions of its successes and the mean score of those that are a number."""
-    labels = Counter(trial.prediction.label for trial in successes)
-    return VerifiedRate(
-        successes=rate.successes,
-        spp=rate.spp,
-        labels=dict(labels.most_common()),
-        margin=0.0 - mean_number(trial.score for trial in trials),
-        **_counted(rate, trials),
-    )
+    labels = dict(Counter(trial.prediction.label for trial in successes).most_common())
+    margin, counted = 0.0 - mean_number(trial.score for trial in trials), _counted(rate, trials)
+    return VerifiedRate(successes=rate.successes, spp=rate.spp, labels=labels, margin=margin, **counted)
 
 
 def control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
-    """Return how many trials of the clean scene are right."""
     right = count_right(trials, spp)
     return ControlGroup(correct=right.successes, **_counted(right, trials))
 
@@ -204,7 +164,6 @@ def mean_number(values: Iterable[float]) -> float:
 Kept = TypeVar("Kept")
 Ending = TypeVar("Ending", bound=Result)
 Kind = TypeVar("Kind", bound=Fields)
-Measured = TypeVar("Measured")
 
 
 class OutOfTime(Exception):
@@ -230,11 +189,6 @@ class Results:
             stored = json.loads(json.dumps(measure()))
             self.put(key, stored)
         return stored
-
-    def value(self, key: str, kind: type[Measured], measure: Callable[[], Measured]) -> Measured:
-        """Return what `measure` returns, or what is stored of this kind (a dataclass, or a list of some); as `get`."""
-        adapter = TypeAdapter(kind)
-        return adapter.validate_python(self.get(key, lambda: adapter.dump_python(measure(), mode="json")))
 
     def row(self, key: str, kind: type[Kind], measure: Callable[[], Kind]) -> Kind:
         """Return the fields that `measure` returns, or those of this kind that are stored; otherwise as `get`."""

@@ -112,8 +112,8 @@ class Rendering:
         """Write ground truth of the view as layers of one EXR, whole or not at all, beside the picture of this path, as
         ``NAME.aov.exr``, and return its path; `aovs` are names of `advsearch.scene.surfaces.AOVS`. Raises InputError
         where `render` was not asked for it, or StorageError."""
-        (surfaces, *others) = [view.surfaces for view in self.views]
-        if surfaces is None or others:
+        surfaces = self.views[0].surfaces
+        if surfaces is None or len(self.views) > 1:
             raise InputError("aov: ground truth is written for a single view, rendered with `aov`; leave `around` out")
         with placed_by("out"):
             return write_layers(Path(path).with_suffix(".aov.exr"), surfaces.layers(aovs, OBJECT), surfaces.notes(aovs))
@@ -135,7 +135,6 @@ class Rendering:
 
     @cached_property
     def _shown(self) -> Any:
-        """The picture, or the sheet of several views."""
         return self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
 
     def __repr__(self) -> str:
@@ -149,50 +148,32 @@ class Rendering:
 
     @property
     def _captions(self) -> list[list[str]]:
-        said = [[seen_text(self.task, prediction) for prediction in view.predictions] for view in self.views]
-        return [[f"azimuth {view.azimuth:g}", *texts] for view, texts in zip(self.views, said, strict=True)]
+        return [
+            [f"azimuth {view.azimuth:g}", *(seen_text(self.task, p) for p in view.predictions)] for view in self.views
+        ]
 
     def result(
         self, out: Path, size: tuple[int, int], warnings: Sequence[str], answered: Path | None = None
     ) -> RenderResult:
         """Return everything but the pictures: with the file that was written, its height and width in pixels, all that
         was said, and the file with the predictions drawn in."""
+        scene, up = self.scene, self.scene.object.up
         return RenderResult(
-            out=str(out),
-            answered=None if answered is None else str(answered),
-            size=size,
-            object=self.scene.object_name,
-            environment=self.scene.environment_name,
-            model=self.model,
-            task=self.task,
-            spp=self.spp,
-            image_formation=Formation.of(self.formation),
-            up=None if self.scene.object.up is None else MeshUp.of(self.scene.object.up),
-            views=[ViewPredictions.of(view) for view in self.views],
-            warnings=list(warnings),
-        )
+            out=str(out), answered=None if answered is None else str(answered), size=size, object=scene.object_name,
+            environment=scene.environment_name, model=self.model, task=self.task, spp=self.spp,
+            image_formation=Formation.of(self.formation), up=None if up is None else MeshUp.of(up),
+            views=[ViewPredictions.of(view) for view in self.views], warnings=list(warnings),
+        )  # fmt: skip
 
 
 @plainly()
 def render(
-    scene: Scene | str | Path,
-    model: Model | nn.Module | str | Path = "reference",
-    *,
-    task: AnyTask = "classification",
-    label: str | None = None,
-    judge: str = OBJECT,
-    controls: Controls = (),
-    around: int | None = None,
-    texture: Texture | None = None,
-    resolution: int | tuple[int, int] | None = None,
-    spp: int = PICTURE_SPP,
-    denoise: str = "oidn",
-    sampler: str = SAMPLER,
-    seed: int = 0,
-    aov: bool = False,
-    at: Tensor | None = None,
+    scene: Scene | str | Path, model: Model | nn.Module | str | Path = "reference", *, task: AnyTask = "classification",
+    label: str | None = None, judge: str = OBJECT, controls: Controls = (), around: int | None = None,
+    texture: Texture | None = None, resolution: int | tuple[int, int] | None = None, spp: int = PICTURE_SPP,
+    denoise: str = "oidn", sampler: str = SAMPLER, seed: int = 0, aov: bool = False, at: Tensor | None = None,
     progress: Watched = None,
-) -> Rendering:
+) -> Rendering:  # fmt: skip
     """Render a scene and ask the model what it sees.
 
     Args:
@@ -250,12 +231,11 @@ def render(
             picture = to_8_bit(space.picture(u, formation.display(radiance)))
             output, truth = model(picture), None
             if asked.varies:
-                told = partial(facts_about, description, description.object_name, label, partial(space.describe, u))
-                looks = [partial(renderer.surfaces, u, camera=number) for number in range(len(description.rig))]
-                facts = told(partial(renderer.surfaces, u), judge)
-                facts = replace(facts, views=tuple(told(look, judge) for look in looks))
+                name, told = description.object_name, partial(space.describe, u)
+                looks = looks_at(renderer, u, len(description.rig))
+                facts = [facts_about(description, name, label, told, look, judge) for look in looks]
                 try:
-                    truth = asked.truth(facts)
+                    truth = asked.truth(replace(facts[0], views=tuple(facts[1:])))
                 except InputError as error:
                     untold = [f"Nothing is drawn into the picture: {error}"]
             asked = asked.after_calibration(output, truth)
@@ -283,14 +263,15 @@ def check_judged(description: SceneDescription, judge: str) -> None:
         )
 
 
+def looks_at(renderer: Renderer, u: Tensor, cameras: int) -> list[Callable[[], Surfaces]]:
+    """Return what looks at a configuration (d,): from the camera, and behind that from each of a rig of so many."""
+    return [partial(renderer.surfaces, u), *(partial(renderer.surfaces, u, camera=number) for number in range(cameras))]
+
+
 def facts_about(
-    description: SceneDescription,
-    name: str,
-    label: str | None,
-    values: Callable[[], Mapping[str, Value]],
-    look: Callable[[], Surfaces] | None = None,
-    judge: str = OBJECT,
-) -> Facts:
+    description: SceneDescription, name: str, label: str | None, values: Callable[[], Mapping[str, Value]],
+    look: Callable[[], Surfaces] | None = None, judge: str = OBJECT,
+) -> Facts:  # fmt: skip
     """Return what a scene, whose object is called `name`, gives a task to judge by.
 
     Args:

@@ -115,7 +115,6 @@ class SurfaceLight(PredictedSearch):
 
     @property
     def too_far_off(self) -> str | None:
-        """Why it predicts nothing, from the comparison before the search, in words."""
         first = self.deviations[0] if self.deviations else None
         return None if first is None or first.good else f"light on surfaces is {first.reason}"
 
@@ -148,8 +147,6 @@ class SurfaceLight(PredictedSearch):
         assert self._renderer is not None
         return self._renderer
 
-    # ---- evaluations ------------------------------------------------------------------------------------------------
-
     def evaluate_all(self, queries: Sequence[Query], traced: Evaluate) -> Iterator[Evaluation]:
         """Answer queries of one search, or trials, by what else answers them from the first that is not predicted."""
         ahead: dict[int, Tensor] = {}
@@ -171,7 +168,8 @@ class SurfaceLight(PredictedSearch):
             whole = problem.whole(query.u)
             with torch.no_grad():
                 shown = to_8_bit(self.renderer(whole) if picture is None else picture)
-            return problem.trial(shown, whole, cost=0, predicted=RAYS, picture=shown if query.keep else None)
+            kept = shown if query.keep else None
+            return Evaluation.of(problem.judge(shown, whole), cost=0, predicted=RAYS, picture=kept)
         if picture is not None:
             ((evaluation, _),), _ = problem.judged(lambda at: picture[None], [query.u], query.u, False)
             kept = to_8_bit(picture) if query.keep else None
@@ -217,8 +215,6 @@ class SurfaceLight(PredictedSearch):
             self._looks[key] = list(self.renderer.looks(inputs))
         looks = self.renderer.looks(inputs) if key is None else self._looks[key]
         return self.renderer.shown(looks, inputs, color, places)
-
-    # ---- comparisons ------------------------------------------------------------------------------------------------
 
     def passed(self, query: Query) -> None:
         """Compare where that is due: every `EVERY` evaluations where base colours are searched, as their light gets

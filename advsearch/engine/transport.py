@@ -67,33 +67,21 @@ def remark(reason: str) -> str:
 
 @dataclass
 class PredictedSearch(ABC):
-    """What predicts the pictures of a run's searches. All of it follows from the seed, so that it can be made again.
+    """What predicts the pictures of a run's searches. All of it follows from the seed, so that it can be made again."""
 
-    Attributes:
-        way: how, in words.
-        exact: whether equal configurations have equal objectives.
-        drawn: whether the search climbs under conditions that each evaluation draws anew; see `Domain.drawn`.
-        steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
-        deviations: of predicted pictures from traced ones, in order.
-        traced: pictures that were traced for what predicts, and to be compared.
-        seconds: spent on both.
-        renewed: how often what predicts was made anew; None where it never is.
-        ends: by kind of search, the evaluation from which on pictures are traced, as predicted ones were too far off;
-            `given_up` says so.
-    """
-
-    way: ClassVar[str] = "matrix"
-    exact: ClassVar[bool] = False
+    way: ClassVar[str] = "matrix"  # how, in words
+    exact: ClassVar[bool] = False  # whether equal configurations have equal objectives
 
     problem: Problem
-    steps: int
-    drawn: bool = field(default=False, kw_only=True)
-    deviations: list[Deviation] = field(default_factory=list, kw_only=True)
-    traced: int = field(default=0, kw_only=True)
-    seconds: float = field(default=0.0, kw_only=True)
-    renewed: int | None = field(default=0, kw_only=True)
+    steps: int  # evaluations of a search; what comes after them belongs to the ranking, and is traced
+    drawn: bool = field(default=False, kw_only=True)  # whether each evaluation draws conditions; see `Domain.drawn`
+    deviations: list[Deviation] = field(default_factory=list, kw_only=True)  # from traced pictures, in order
+    traced: int = field(default=0, kw_only=True)  # pictures, for what predicts and to be compared
+    seconds: float = field(default=0.0, kw_only=True)  # spent on both
+    renewed: int | None = field(default=0, kw_only=True)  # how often it was made anew; None where it never is
+    # by kind of search, the evaluation from which on pictures are traced, as predicted ones were too far off
     ends: dict[str, int] = field(default_factory=dict, kw_only=True)
-    given_up: str | None = field(default=None, kw_only=True)
+    given_up: str | None = field(default=None, kw_only=True)  # says so
 
     @property
     @abstractmethod
@@ -143,25 +131,17 @@ class PredictedSearch(ABC):
 
     @contextmanager
     def timed(self) -> Iterator[None]:
-        """Count the time of a block."""
         begun = time.perf_counter()
         yield
         self.seconds += time.perf_counter() - begun
 
     def summary(self) -> LinearTransport:
-        """What a result holds of it."""
         entries, size = self.size()
         return LinearTransport(
-            used=True,
-            way=self.way,
-            reason=self.given_up,
-            conditions=self.conditions(),
-            entries=entries,
-            bytes=size,
-            seconds=self.seconds,
-            renewed=self.renewed,
+            used=True, way=self.way, reason=self.given_up, conditions=self.conditions(), entries=entries, bytes=size,
+            seconds=self.seconds, renewed=self.renewed,
             error=PredictionError.of(self.deviations[-1]) if self.deviations else None,
-        )
+        )  # fmt: skip
 
 
 @dataclass
@@ -233,8 +213,6 @@ class Transport(PredictedSearch):
         self.renewed = (self.renewed or 0) + 1
         return self._present[kind]
 
-    # ---- the smallest change ----------------------------------------------------------------------------------------
-
     def likely(self, u: Tensor) -> bool:
         """Whether the picture that is predicted from the start would pass its trials, as far as those of the last
         configuration tell."""
@@ -248,4 +226,4 @@ class Transport(PredictedSearch):
 
     def _score(self, u: Tensor) -> float:
         with torch.no_grad():
-            return self.problem.trial(to_8_bit(self.start(u)), u).said.score
+            return self.problem.judge(to_8_bit(self.start(u)), u).score

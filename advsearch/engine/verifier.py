@@ -127,51 +127,31 @@ class Verifier:
         self._clean_spp = self.findings.spp
         self._clean_kind = "first control" if self.findings.search is None else "control"
         self.findings.clean = run_trials(
-            self.evaluate_all,
-            self.problem.domain.start,
-            spp=self._clean_spp,
-            seed=self.problem.seed,
-            trials=self.looks[0],
-            kind=self._clean_kind,
-            keep=KEPT,
-        )
+            self.evaluate_all, self.problem.domain.start, spp=self._clean_spp, seed=self.problem.seed,
+            trials=self.looks[0], kind=self._clean_kind, keep=KEPT,
+        )  # fmt: skip
 
     @property
     def clean_tried(self) -> bool:
-        """Whether the control group has been through its trials at this sample count."""
         return bool(self.findings.clean) and self._clean_spp == self.findings.spp
 
     def verified(self, kind: str, found: SearchResult, *, curtailed: bool = False, again: bool = False) -> Verification:
         """Verify what one search found against the control group; `curtailed` where only the verdict matters. A control
         group that has too few trials gets more. `again`: in trials after all others, both groups anew."""
         checked = verify(
-            self.evaluate_all,
-            self.problem.domain,
-            found.best_u,
-            claim=found.ending,
-            spp=self.findings.spp,
-            seed=self.problem.seed,
-            trials=self.looks,
-            clean=() if again else self.findings.clean,
-            rule=self.problem.rule,
-            kind=kind,
-            control=self._clean_kind,
-            keep=KEPT,
-            curtailed=curtailed,
+            self.evaluate_all, self.problem.domain, found.best_u, claim=found.ending, spp=self.findings.spp,
+            seed=self.problem.seed, trials=self.looks, clean=() if again else self.findings.clean,
+            rule=self.problem.rule, kind=kind, control=self._clean_kind, keep=KEPT, curtailed=curtailed,
             begin=self.count if again else 0,
-        )
+        )  # fmt: skip
         if not again:
             self.findings.clean = checked.clean_trials
         return checked
 
     def trials(
-        self,
-        kind: str,
-        configurations: Mapping[int, Tensor],
-        *,
-        sought: bool = True,
+        self, kind: str, configurations: Mapping[int, Tensor], *, sought: bool = True,
         predictor: PredictedSearch | None = None,
-    ) -> Iterator[Judgement]:
+    ) -> Iterator[Judgement]:  # fmt: skip
         """Try configurations once each, every one with a seed of its own, by their numbers among those of a kind; a
         `predictor` as for `evaluate_all`."""
         problem, queries = self.problem, list[Query]()
@@ -184,46 +164,34 @@ class Verifier:
 
     def average(self, count: int) -> None:
         """Try configurations drawn from the whole space and budget: how often the model is wrong on average."""
-        domain, judgements = self.problem.domain, list[Judgement]()
-
-        def drawn(number: int) -> Tensor:
-            return domain.sample(torch.Generator().manual_seed(seeds.stream(self.problem.seed, "draw", number)))[0]
-
+        problem, judgements = self.problem, list[Judgement]()
         self.begin("trying random configurations", count, name="average", flags="`average`")
-        for numbers in batches(0, count, most_at_once(domain.dim)):
-            judgements += self.trials("average", {number: drawn(number) for number in numbers})
+        for numbers in batches(0, count, most_at_once(problem.domain.dim)):
+            rngs = {n: torch.Generator().manual_seed(seeds.stream(problem.seed, "draw", n)) for n in numbers}
+            judgements += self.trials("average", {n: problem.domain.sample(rng)[0] for n, rng in rngs.items()})
         self.findings.average = tuple(judgements)
 
     def begin(
-        self,
-        title: str,
-        trials: int,
-        *,
-        name: str = "verification",
-        flags: str = "`trials` or `verify_spp`",
+        self, title: str, trials: int, *, name: str = "verification", flags: str = "`trials` or `verify_spp`",
         at_most: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         most = "at most " if at_most else ""
         hint = f"{most}{trials} pictures of {plural(self.findings.spp, 'sample')} a pixel; {flags} shorten it"
         self.stages.begin(name, title, trials, hint=hint, at_most=at_most)
-
-
-def unchanged(picture: Tensor, seed: int) -> Tensor:
-    """Return a picture as it is."""
-    return picture
 
 
 @dataclass(frozen=True, eq=False)
 class RetrialCondition:
     """What a configuration is tried under. Conditions of equal source are shown the same picture before it is changed:
     (H, W, 3) sRGB in [0, 1], by the seed of its trial; those of equal light get theirs from one linear radiance, as
-    their scenes are the same and only tone curves or models differ (None: this one renders by itself)."""
+    their scenes are the same and only tone curves or models differ (None: this one renders by itself). `change` goes
+    from the picture and the seed of the trial to what the model is shown."""
 
     name: str
     problem: Problem
     spp: int
     source: Hashable
-    change: Callable[[Tensor, int], Tensor] = unchanged
+    change: Callable[[Tensor, int], Tensor] | None = None
     light: Hashable = None
 
 
@@ -233,16 +201,10 @@ class Retrials:
     workers hold the problems by the names of their conditions; without, pictures are made here."""
 
     def __init__(
-        self,
-        conditions: Sequence[RetrialCondition],
-        run: RunDirectory,
-        progress: Progress,
-        *,
-        trials: int,
-        seed: int,
+        self, conditions: Sequence[RetrialCondition], run: RunDirectory, progress: Progress, *, trials: int, seed: int,
         executor: Executor | None = None,
-    ) -> None:
-        self._conditions, self._progress, self._count, self._seed = conditions, progress, trials, seed
+    ) -> None:  # fmt: skip
+        self._progress, self._count, self._seed = progress, trials, seed
         first = Journal(run, Shared(conditions[0].problem))
         self._journals = {
             condition.name: replace(first, traced=Shared(condition.problem, executor, condition.name))
@@ -257,30 +219,19 @@ class Retrials:
     def clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
         if condition.name not in self._clean:
             self._clean[condition.name] = run_trials(
-                partial(self._evaluations, "clean", condition),
-                condition.problem.domain.start,
-                spp=condition.spp,
-                seed=self._seed,
-                trials=self._count,
-                kind=f"clean under {condition.name}",
-            )
+                partial(self._evaluations, "clean", condition), condition.problem.domain.start, spp=condition.spp,
+                seed=self._seed, trials=self._count, kind=f"clean under {condition.name}",
+            )  # fmt: skip
         return self._clean[condition.name]
 
     def adversarial(self, kind: str, u: Tensor, condition: RetrialCondition) -> Verification:
         """Try a configuration (d,) under one condition, beside the clean scene; a claim of nothing is never confirmed.
         Its rows are called "KIND under CONDITION"."""
         return verify(
-            partial(self._evaluations, kind, condition),
-            condition.problem.domain,
-            u,
-            claim=Ending.NOT_VERIFIED,
-            spp=condition.spp,
-            seed=self._seed,
-            trials=self._count,
-            clean=self.clean(condition),
-            rule=condition.problem.rule,
-            kind=f"{kind} under {condition.name}",
-        )
+            partial(self._evaluations, kind, condition), condition.problem.domain, u, claim=Ending.NOT_VERIFIED,
+            spp=condition.spp, seed=self._seed, trials=self._count, clean=self.clean(condition),
+            rule=condition.problem.rule, kind=f"{kind} under {condition.name}",
+        )  # fmt: skip
 
     def _evaluations(self, kind: str, condition: RetrialCondition, queries: Sequence[Query]) -> Iterator[Evaluation]:
         changed = partial(self._changed, kind, condition)
@@ -294,20 +245,22 @@ class Retrials:
             self._pictures.clear()
             self._lights.clear()
             self._pictured = kind
-        problem, keys = condition.problem, {q.seed: (condition.source, q.seed, condition.spp) for q in queries}
-        new = [replace(query, wanted="picture") for query in queries if keys[query.seed] not in self._pictures]
-        shared = self._journals[condition.name].traced
-        sent = iter(shared(new)) if shared.executor is not None and len(new) > 1 else None
-        for query in queries:
-            key, machine = keys[query.seed], None
-            if key not in self._pictures and sent is None:
-                self._pictures[key] = self._rendered(condition, query.u, query.seed)
-            elif key not in self._pictures and sent is not None:
-                evaluation = next(sent)
-                assert evaluation.picture is not None
-                self._pictures[key], machine = evaluation.picture, evaluation.machine
-            picture, whole = condition.change(self._pictures[key], query.seed), problem.whole(query.u, query.seed)
-            yield problem.trial(to_8_bit(picture), whole, machine=machine)
+        problem, shared = condition.problem, self._journals[condition.name].traced
+        keys = [(condition.source, query.seed, condition.spp) for query in queries]
+        new = [replace(q, wanted="picture") for q, key in zip(queries, keys, strict=True) if key not in self._pictures]
+        sent = iter(shared(new) if shared.executor is not None and len(new) > 1 else ())
+        for query, key in zip(queries, keys, strict=True):
+            machine = None
+            if key not in self._pictures:
+                evaluation = next(sent, None)
+                if evaluation is None or evaluation.picture is None:  # it is made here
+                    self._pictures[key] = self._rendered(condition, query.u, query.seed)
+                else:
+                    self._pictures[key], machine = evaluation.picture, evaluation.machine
+            picture = self._pictures[key]
+            picture = picture if condition.change is None else condition.change(picture, query.seed)
+            said = problem.judge(to_8_bit(picture), problem.whole(query.u, query.seed))
+            yield Evaluation.of(said, machine=machine)
 
     def _rendered(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
         """As `Problem.picture`, from the radiance of other conditions with the same light where there are any."""
@@ -322,7 +275,6 @@ class Retrials:
 
 
 def kept_configuration(folder: Path, problem: Problem) -> torch.Tensor:
-    """Return the configuration (d,) that a run found, of its problem loaded again."""
     u = torch.from_numpy(read_configuration(folder))
     if u.shape != problem.domain.start.shape:
         raise InputError(

@@ -30,7 +30,6 @@ HOME = Path("runs")  # where runs live that are called by name, in the current d
 CONFIG = "run.yaml"
 REPORT = "report.html"
 COLUMNS = "columns.bin"  # of a sweep that has ended: its rows as columns of numbers (advsearch/viewer/columns.py)
-
 IMAGES = "images"
 SMALL_PICTURES = f"{IMAGES}/rows"  # of a sweep, in folders of a thousand
 ARTIFACTS = "artifacts"
@@ -38,26 +37,13 @@ OBJECT_FILE = f"{ARTIFACTS}/object.glb"  # what was attacked, before and after, 
 AOV_FOLDER = "aov"  # of a sweep: the ground truth of each picture, by its number
 PARTS = "parts"  # runs that a study consists of
 
-ONLY_HERE = "only in Python"
-"""The note under which the store keeps, in words, what a run has that no file and no command can name."""
-
-BEGUN_WITH = "settings"
-"""The note under which the store keeps what decides the run's numbers, as it was when the run began."""
+ONLY_HERE = "only in Python"  # the note of what a run has, in words, that no file and no command can name
+BEGUN_WITH = "settings"  # the note of what decides the run's numbers, as it was when the run began
 
 CONTENTS = (
-    CONFIG,
-    store.NAME,
-    f"{store.NAME}-wal",
-    f"{store.NAME}-shm",
-    f"{store.NAME}-journal",
-    summary.NAME,
-    REPORT,
-    COLUMNS,
-    IMAGES,
-    ARTIFACTS,
-    AOV_FOLDER,
-    PARTS,
-)
+    CONFIG, *(f"{store.NAME}{ending}" for ending in ("", "-wal", "-shm", "-journal")), summary.NAME, REPORT, COLUMNS,
+    IMAGES, ARTIFACTS, AOV_FOLDER, PARTS,
+)  # fmt: skip
 """All that a run writes. `overwrite` removes these and nothing else."""
 
 
@@ -172,10 +158,6 @@ class RunDirectory:
             raise InputError(
                 f"{self.path}: cannot resume: {differ} now; set it back to what the run began with, or {self.again}"
             )
-
-    def finish(self) -> None:
-        """Remove what only a run that goes on needs."""
-        self.store.forget()
 
     def write_config(self, config: Config) -> Path:
         """Write `run.yaml`, from which `advsearch run` repeats the run, and return its path.
@@ -362,7 +344,6 @@ def is_run(path: Path) -> bool:
     """Return whether advsearch wrote the directory: by the header of its `run.yaml` or of its `results.sqlite`."""
     if files.is_results_database(path / store.NAME):
         return True
-
     if os.path.islink(path / CONFIG):
         return False
     try:

@@ -21,7 +21,6 @@ from advsearch.runs.files import placed_by, replacing, write_bytes, write_text
 from advsearch.runs.store import Row, Store
 
 FORMATS = ("csv", "json", "parquet")
-
 PAYLOAD = "payload"
 OWN = (
     *("id", "kind", "step", "phase", "seed", "spp", "objective", "score", "success", "correct", "margin"),
@@ -59,21 +58,22 @@ def as_columns(rows: Iterable[Row]) -> list[str]:
 
 
 def as_record(row: Row) -> JsonObject:
-    """Return a row as column to value."""
     own = {one.name: getattr(row, one.name) for one in fields(row) if one.name not in ("values", "metrics")}
     return own | dict(row.metrics) | _values(row.values)
 
 
-def _values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
-    found: JsonObject = {}
+def each_value(values: Mapping[str, Value | JsonValue]) -> Iterator[tuple[str, JsonValue, str]]:
+    """Yield values by name with their units; of several numbers each, as ``camera.target[0]``."""
     for name, told in values.items():
         value, unit = (told.get("value"), told.get("unit", "")) if isinstance(told, Mapping) else (told, "")
-        suffix = f" [{unit}]" if unit else ""
         if isinstance(value, (list, tuple)):
-            found |= {f"{name}[{number}]{suffix}": inner for number, inner in enumerate(value)}
+            yield from ((f"{name}[{number}]", inner, str(unit)) for number, inner in enumerate(value))
         else:
-            found[f"{name}{suffix}"] = value
-    return found
+            yield name, value, str(unit)
+
+
+def _values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
+    return {f"{name} [{unit}]" if unit else name: value for name, value, unit in each_value(values)}
 
 
 def _csv(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:
@@ -107,7 +107,11 @@ def _parquet(records: Iterable[JsonObject], names: list[str], stream: IO[bytes])
         raise InputError("format parquet: needs pyarrow; pip install pyarrow, or choose csv or json") from None
     rows = map(_flat, records)
     first = list(itertools.islice(rows, GROUP))
-    schema = pyarrow.schema([(name, _arrow_type(name, first, pyarrow)) for name in names])
+    arrow = {"str": pyarrow.string(), "bool": pyarrow.bool_(), "int": pyarrow.int64(), "float": pyarrow.float64()}
+    kinds = {one.name: arrow.get(str(one.type).partition(" ")[0], arrow["str"]) for one in fields(Row)}
+    for name in set(names) - {*OWN, *AFTER}:
+        kinds[name] = arrow["str" if any(isinstance(record.get(name), str) for record in first) else "float"]
+    schema = pyarrow.schema([(name, kinds[name]) for name in names])
     with pyarrow.parquet.ParquetWriter(stream, schema) as writer:
         while first:
             columns: dict[str, list[Any]] = {}
@@ -119,21 +123,8 @@ def _parquet(records: Iterable[JsonObject], names: list[str], stream: IO[bytes])
             first = list(itertools.islice(rows, GROUP))
 
 
-def _arrow_type(name: str, rows: Sequence[JsonObject], pyarrow: Any) -> Any:
-    declared = {one.name: str(one.type) for one in fields(Row)}.get(name)
-    if name == PAYLOAD:
-        return pyarrow.string()
-    if declared is not None:
-        kinds = (("str", pyarrow.string()), ("bool", pyarrow.bool_()), ("int", pyarrow.int64()))
-        return next((arrow for text, arrow in kinds if declared.startswith(text)), pyarrow.float64())
-    texts = any(isinstance(one.get(name), str) for one in rows)
-    return pyarrow.string() if texts else pyarrow.float64()
-
-
 DETAILS, CLASSES, IMAGES = "details.log", "class_maps.json", "images"
-
 LARGEST = 4 << 30
-
 LONGEST = 1 << 20  # most bytes of one of its lines
 MOST_CLASSES = 16 << 20  # most bytes of a `class_maps.json`
 _PLACED = ("environment", "object")  # values that have a place of their own in a line
@@ -222,7 +213,7 @@ def _imported(folder: Path, number: int, line: bytes, classes: Sequence[str]) ->
     values: dict[str, Value] = {"object": _value(told.get("model")), "environment": _value(told.get("environment"))}
     for name, value in told["render_args"].items():
         if isinstance(value, list):
-            values |= {f"{name}[{place}]": _value(one) for place, one in enumerate(value)}
+            values |= {f"{name}[{place}]": _value(inner) for place, inner in enumerate(value)}
         else:
             values["model" if name == "network" else name] = _value(value)
     prediction = told.get("prediction")
@@ -230,15 +221,9 @@ def _imported(folder: Path, number: int, line: bytes, classes: Sequence[str]) ->
     index = int(first) if _is_number(first) else None
     label = classes[index] if index is not None and 0 <= index < len(classes) else "" if index is None else str(index)
     loss = told.get("loss")
-    row = Row(
-        kind="sweep",
-        step=number,
-        correct=str(told.get("is_correct")) == "True",
-        margin=0.0 - loss if isinstance(loss, (int, float)) else None,
-        label=label,
-        label_index=index,
-        values=values,
-    )
+    margin = 0.0 - loss if isinstance(loss, (int, float)) else None
+    right = str(told.get("is_correct")) == "True"
+    row = Row("sweep", number, correct=right, margin=margin, label=label, label_index=index, values=values)
     picture = folder / IMAGES / f"{told.get('id')}_rgb.png"
     safe = re.fullmatch(r"[A-Za-z0-9_-]{1,100}", str(told.get("id")))
     return row, picture if safe and picture.is_file() and not picture.is_symlink() else None

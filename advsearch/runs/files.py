@@ -52,7 +52,12 @@ def storage_errors(path: Path) -> Iterator[None]:
         yield
     except (OSError, sqlite3.OperationalError) as error:
         check_there(path)
-        raise StorageError(f"cannot write {path}: {_advice(error)}") from error
+        if isinstance(error, OSError):
+            known, text = _ADVICE.get(error.errno or 0), str(error.strerror or error)
+        else:
+            known, text = next((how for words, how in _SQLITE_ADVICE.items() if words in str(error)), None), str(error)
+        advice = known or f"{text}; choose another place with `run`"
+        raise StorageError(f"cannot write {path}: {advice}") from error
 
 
 @contextmanager
@@ -104,13 +109,6 @@ def _flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _advice(error: OSError | sqlite3.Error) -> str:
-    if isinstance(error, OSError):
-        return _ADVICE.get(error.errno or 0, f"{error.strerror or error}; choose another place with `run`")
-    known = (advice for words, advice in _SQLITE_ADVICE.items() if words in str(error))
-    return next(known, f"{error}; choose another place with `run`")
 
 
 _open: dict[Path, tuple[Path, tuple[int, int]]] = {}
@@ -168,12 +166,17 @@ class RunLock:
             os.write(self._descriptor, str(os.getpid()).encode())
         except OSError as error:
             pid = os.pread(self._descriptor, 32, 0).decode(errors="replace")
-            message = _refusal(error, folder, f"process {pid}" if pid.isdigit() else "another process")
             self.release()
-            raise message from None
+            if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+                owner = f"process {pid}" if pid.isdigit() else "another process"
+                raise InputError(
+                    f"{folder}: {owner} is working on this run; wait for it or choose another name with `run`"
+                ) from None
+            if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
+                raise StorageError(f"{folder}: the file system has no locks; choose a local disk with `run`") from None
+            raise StorageError(f"cannot lock {folder}: {error.strerror}; choose another place with `run`") from None
 
     def release(self) -> None:
-        """Give the lock up; a second call does nothing."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
@@ -194,20 +197,9 @@ def is_held(folder: Path) -> bool:
     return False
 
 
-def _refusal(error: OSError, folder: Path, owner: str) -> Exception:
-    if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-        return InputError(f"{folder}: {owner} is working on this run; wait for it or choose another name with `run`")
-    if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
-        return StorageError(f"{folder}: the file system has no locks; choose a local disk with `run`")
-    return StorageError(f"cannot lock {folder}: {error.strerror}; choose another place with `run`")
-
-
 DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run again"
-
 LARGEST = 64 << 30
-
 APPLICATION_ID = 0x41445653  # in the header of every results.sqlite that is ours: "ADVS"
-
 VERSION = 9
 """Of the tables; in the header of the file. Files of another version are read by the advsearch that wrote them."""
 
@@ -276,7 +268,7 @@ def is_results_database(path: Path) -> bool:
 
 
 def is_bare(path: Path) -> bool:
-    """Return whether the file at `path`, which is ours, has no tables yet: its process was killed as it made them."""
+    """Return whether a file of ours has no tables yet: its process was killed as it made them."""
     with readable(path), closing(connect_to_read(path)) as db:
         return _version(db) == 0 and not _schema(db)
 
@@ -313,7 +305,6 @@ def _schema(db: sqlite3.Connection) -> frozenset[Any]:
 
 
 def connect_to_write(path: Path) -> sqlite3.Connection:
-    """Open or make the file."""
     if os.path.islink(path):
         raise FileFormatError(f"{path}: expected a file of this run, got a link to another; {DAMAGED}")
     if path.exists():
@@ -381,14 +372,10 @@ BAD_PICTURE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 """What Pillow raises of a file that is no picture, a damaged one or one that is far too large."""
 
 DIFFERENCE_GAIN = 5.0
-
 ANIMATION_BYTES = 3_000_000
-
 ANIMATION_FRAMES = 60  # most frames of an animation; of more, every second, third, ... is shown, and always the last
 ANIMATION_SIDE = 320  # longest side of an animation in pixels; larger pictures are averaged down
-
 _PALETTE_PIXELS = 200_000
-
 FRAME_MS, LAST_FRAME_MS = 100, 2500
 
 
@@ -467,45 +454,32 @@ def _write_exr(path: Path, channels: Mapping[str, Any], notes: Mapping[str, str]
 
 def animation_bytes(frames: Sequence[Any]) -> bytes:
     """Return the display-referred pictures as a GIF that repeats, holds its last frame and is at most 3 MB."""
-    chosen, shrink = _spread(frames, ANIMATION_FRAMES), 1
+    count, shrink = min(len(frames), ANIMATION_FRAMES), 1
     while True:
-        pictures = [_shrunk(to_8bit(frame), shrink) for frame in chosen]
+        chosen = np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)  # the first and the last among them
+        pictures = [Image.fromarray(_picture(to_8bit(frames[place]))) for place in chosen]
+        block = max(shrink, -(-max(pictures[0].size) * shrink // ANIMATION_SIDE))
+        width, height = (side - side % block if side > block else side for side in pictures[0].size)
+        pictures = [picture.reduce(block, (0, 0, width, height)) for picture in pictures]
         data = _gif(pictures)
-        if len(data) <= ANIMATION_BYTES or min(pictures[0].shape[:2]) < 16:
+        if len(data) <= ANIMATION_BYTES or min(pictures[0].size) < 16:
             return data
-        if len(chosen) > 10:
-            chosen = _spread(chosen, min(len(chosen) * 9 // 10, len(chosen) * ANIMATION_BYTES // len(data)))
+        if count > 10:
+            count = min(count * 9 // 10, count * ANIMATION_BYTES // len(data))
         else:
             shrink *= 2
 
 
-def _gif(pictures: Sequence[Bytes]) -> bytes:
-    """Return a GIF with one palette for all frames, by Pillow itself: 20 times as fast as through imageio."""
-    pixels = np.concatenate(pictures)
+def _gif(pictures: Sequence[Image.Image]) -> bytes:
+    # one palette for all frames, by Pillow itself: 20 times as fast as through imageio
+    pixels = np.concatenate([np.asarray(picture) for picture in pictures])
     stride = 1 + pixels.shape[0] * pixels.shape[1] // _PALETTE_PIXELS
     palette = Image.fromarray(np.ascontiguousarray(pixels[::stride])).quantize(256)
-    frames = [Image.fromarray(one).quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures]
+    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     several, buffer = len(frames) > 1, io.BytesIO()
     durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS] if several else LAST_FRAME_MS
     frames[0].save(buffer, "GIF", loop=0, duration=durations, save_all=several, append_images=frames[1:])
     return buffer.getvalue()
-
-
-def _spread(frames: Sequence[Any], count: int) -> list[Any]:
-    """Return at most `count` frames at even distances, with the first and the last."""
-    places = np.linspace(0, len(frames) - 1, min(count, len(frames)))
-    return [frames[int(place)] for place in np.rint(places)]
-
-
-def _shrunk(picture: Bytes, least: int) -> Bytes:
-    """Return the picture with its longest side at most `ANIMATION_SIDE` / `least`, by averaging whole blocks."""
-    block = max(least, -(-max(picture.shape[:2]) * least // ANIMATION_SIDE))
-    height, width = (side // block * block for side in picture.shape[:2])
-    if block == 1 or not height or not width:
-        return picture
-    blocks = picture[:height, :width].reshape(height // block, block, width // block, block, -1)
-    means: Floats = blocks.mean(axis=(1, 3), dtype=np.float32)
-    return np.rint(means).astype(np.uint8)
 
 
 def _picture(array: Any) -> Any:

@@ -53,7 +53,6 @@ def finished(path: Path) -> bool:
 
 
 def can_resume(path: Path) -> bool:
-    """Whether a run keeps what a search needs to go on."""
     with store.Store(path / store.NAME, read_only=True) as results:
         return results.goes_on
 
@@ -102,18 +101,13 @@ def _as_far_as_read(path: Path, counts: bool, running: bool, faults: list[str]) 
     controls = getattr(result, "controls", ()) or config.get("controls") or ()
     ending = "stopped" if result is None or result.goes_on else str(getattr(result, "ending", "done"))
     return Listed(
-        name=path.name,
-        path=str(path),
-        command=str(config.get("command") or (result.command if result else "?")),
+        path.name, str(path), command=str(config.get("command") or (result.command if result else "?")),
         object=str(config.get("object") or object_name or ("" if config else "?")),
         controls=tuple(map(str, controls)) if isinstance(controls, (list, tuple, dict)) else ("?",),
-        rows=sum(kinds.values()),
-        state="running" if running else ending,
-        answer=result.brief if result else "",
-        kinds=kinds,
-        begun=bool(config),
+        rows=sum(kinds.values()), state="running" if running else ending, answer=result.brief if result else "",
+        kinds=kinds, begun=bool(config),
         when=next((file.stat().st_mtime for file in (path / CONFIG, path / summary.NAME) if file.exists()), None),
-    )
+    )  # fmt: skip
 
 
 @contextmanager

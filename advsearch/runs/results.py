@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 
 SCHEMA = 1
-
 INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"  # endings of a run that can go on
 RUNNING = "running"  # how a result stands that is read while a process works on its run; none is kept so
 END = ("warnings", "seconds", "seed", "command_line")  # fields that are written last, in this order
@@ -35,7 +34,6 @@ Interval = tuple[JsonFloat, JsonFloat]  # both ends of a 95 % interval
 
 
 def having(*names: str) -> AfterValidator:
-    """Return the check that a mapping has these names."""
 
     def check(values: Mapping[str, object]) -> Mapping[str, object]:
         missing = [name for name in names if name not in values]
@@ -256,7 +254,6 @@ class GroupDerivative(Fields):
 
     @property
     def name(self) -> str:
-        """``control.parameter``."""
         return f"{self.control}.{self.parameter}"
 
 

@@ -33,7 +33,6 @@ from advsearch.runs.files import (
 from advsearch.runs.results import plain
 
 NAME = "results.sqlite"
-
 SYNC_INTERVAL = 1.0  # least seconds between two forced writes to the disk; what a power cut may cost
 SYNC_SHARE = 0.02  # largest share of the time that forced writes may take
 
@@ -122,7 +121,10 @@ class Store:
             with self._db:
                 self._db.executemany(_INSERT, (_encode(row, stamp) for row in rows))
                 if told is not None:
-                    self._db.execute(_INSERT_TOLD, (*_encoded(told), rows[-1].kind, rows[-1].step))
+                    arrays = [None if array is None else array.tobytes() for array in (told.gradient, told.picture)]
+                    height = None if told.picture is None else len(told.picture)
+                    beside = (told.number, told.u, told.non_finite, told.cost, *arrays, height)
+                    self._db.execute(_INSERT_TOLD, (*beside, rows[-1].kind, rows[-1].step))
         if force:
             ended = time.monotonic()
             self._next_sync = ended + max(SYNC_INTERVAL, (ended - began) / SYNC_SHARE)
@@ -179,16 +181,11 @@ class Store:
                 self._db.execute("VACUUM")
 
     def last_step(self, kind: str) -> int:
-        """Return the largest step of a kind; -1 where there is none."""
         return int(next(self._select("coalesce(max(step), -1) FROM evaluations WHERE kind = ?", kind))[0])
 
     def count(self, kind: str | None = None) -> int:
         where, given = ("", []) if kind is None else (" WHERE kind = ?", [kind])
         return int(next(self._select(f"count(*) FROM evaluations{where}", *given))[0])
-
-    def curve(self, kind: str) -> list[tuple[int, float | None]]:
-        """Return (step, objective) of every row of one kind, in the order in which they were written."""
-        return [(row.step, row.objective) for row in self.rows(kind)]
 
     def missing(self, kind: str, count: int) -> Iterator[range]:
         """Yield the steps from 0 to `count` of which there is no row of a kind, neighbours together."""
@@ -248,7 +245,6 @@ _JSON = json.JSONEncoder(allow_nan=False)
 
 
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
-    """Return the row's columns. Numbers of numpy and torch become Python's."""
     values = []
     for name in _OTHERS:
         value = getattr(row, name)
@@ -263,18 +259,14 @@ def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     return (*values, stamp, row.id)
 
 
-def _column_types() -> dict[str, tuple[type, ...]]:
-    """Return what each column of a row holds; SQLite itself takes anything anywhere."""
-    held: dict[Any, tuple[type, ...]] = {bool: (int,), float: (float, int)}
-    hints = {name: get_args(hint) or (hint,) for name, hint in get_type_hints(Row).items() if name not in _AS_JSON}
-    types = {name: tuple(kind for part in parts for kind in held.get(part, (part,))) for name, parts in hints.items()}
-    return {**types, "payload": (str, type(None)), "metrics": (str, type(None)), "values": (str,)}
-
-
-_TYPES = _column_types()
+_HELD: dict[Any, tuple[type, ...]] = {bool: (int,), float: (float, int)}
+_TYPES: dict[str, tuple[type, ...]] = {
+    name: tuple(held for kind in get_args(hint) or (hint,) for held in _HELD.get(kind, (kind,)))
+    for name, hint in get_type_hints(Row).items()
+} | {"payload": (str, type(None)), "metrics": (str, type(None)), "values": (str,)}
+"""What each column of a row holds; SQLite itself takes anything anywhere."""
 
 _INFINITE = (math.inf, -math.inf)
-
 LARGEST_NUMBER = 1e300  # larger numbers are none in rows: what is reckoned from them would overflow
 
 MOST_STEPS = (1 << 32) - 1
@@ -299,12 +291,6 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
     for name in ("success", "correct"):
         given[name] = None if given[name] is None else bool(given[name])
     return Row(**given)
-
-
-def _encoded(told: Told) -> tuple[Any, ...]:
-    arrays = [None if one is None else one.tobytes() for one in (told.gradient, told.picture)]
-    height = None if told.picture is None else len(told.picture)
-    return told.number, told.u, told.non_finite, told.cost, *arrays, height
 
 
 def _told(values: tuple[Any, ...], path: Path) -> Told:
@@ -336,12 +322,8 @@ def _named(text: str, fits: Callable[[Any], bool]) -> dict[str, Any] | None:
 def _is_value(told: object) -> bool:
     if not isinstance(told, dict) or not isinstance(told.get("unit"), str) or "value" not in told:
         return False
-    value = told["value"]
-    return _is_plain(value) or (isinstance(value, list) and all(map(_is_plain, value)))
-
-
-def _is_plain(value: object) -> bool:
-    return isinstance(value, str) or _is_metric(value)
+    values = told["value"] if isinstance(told["value"], list) else [told["value"]]
+    return all(isinstance(value, str) or _is_metric(value) for value in values)
 
 
 def _is_metric(value: object) -> bool:

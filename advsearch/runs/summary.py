@@ -27,12 +27,10 @@ from advsearch.runs.results import RUNNING, Result, kind_of
 from advsearch.settings.configuration import FILES
 
 NAME = "summary.json"
-
 LARGEST = 64 << 20
 
 
 def to_json(result: Result) -> str:
-    """Return a result as text."""
     return json.dumps(result.to_dict(), indent=2, allow_nan=False, ensure_ascii=False)
 
 
@@ -59,8 +57,7 @@ def stored_result(folder: Path) -> Result:
         raise other_summary(path, str(error)) from None
     if not isinstance(values, dict):
         raise other_summary(path, type(values).__name__)
-    kind = kind_of(values)
-    if kind is None:
+    if (kind := kind_of(values)) is None:
         raise other_summary(path, f"one of the command {str(values.get('command'))[:40]!r}")
     try:
         return kind.of(values)
@@ -78,9 +75,7 @@ def other_summary(path: Path, got: str) -> FileFormatError:
 CONFIGURATION = "adversarial.npy"
 FORMERLY = "answer.npy"  # what runs that were made before call it
 FOLDER = "artifacts"
-
 LARGEST_CONFIGURATION = 1 << 30
-
 MAGIC = b"\x93NUMPY\x01\x00"  # how a file of numpy's begins, of version 1.0
 MOST = 1 << 10  # bytes within which a header ends
 HEADER = re.compile(
@@ -145,7 +140,7 @@ BUNDLED = {"objects": "object", "environments": "environment"}
 
 def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
     """Return the SHA-256 of what is bundled and settings name: objects, environments and the reference model."""
-    package, found = Path(__file__).parent.parent, dict[str, str]()
+    package, digests = Path(__file__).parent.parent, dict[str, str]()
     said = " ".join(str(settings.get(name) or "") for name in ("object", "environment", "things", "held_out", "grid"))
     words = {*re.findall(r"[a-z][a-z0-9-]*", said), *([] if settings.get("environment") else ["studio"])}
     for folder, kind in BUNDLED.items():
@@ -153,11 +148,11 @@ def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
             if place.stem in words:
                 files = sorted(place.iterdir()) if place.is_dir() else [place]
                 parts = "".join(f"{file.name} {_digest(file)}\n" for file in files if file.is_file())
-                found[f"bundled {kind} {place.stem}"] = hashlib.sha256(parts.encode()).hexdigest()
+                digests[f"bundled {kind} {place.stem}"] = hashlib.sha256(parts.encode()).hexdigest()
     weights = package / "models" / "data" / "reference.safetensors"
     if re.search(r"(^|,)reference(,|$)", str(settings.get("model") or "reference")) and weights.is_file():
-        found["bundled model reference"] = _digest(weights)
-    return found
+        digests["bundled model reference"] = _digest(weights)
+    return digests
 
 
 def changed_file(before: Sequence[Mapping[str, object]], settings: Mapping[str, object]) -> str | None:
@@ -184,38 +179,28 @@ def file_digests(settings: Mapping[str, object]) -> dict[str, str]:
                 parts = opened_for(own)
                 folder = path if os.path.isabs(path) else path.removeprefix("hf:") if path.startswith("hf:") else ""
                 if folder and name in FOLDERS and Path(folder).is_dir():
-                    found[folder] = _digest_of_folder(Path(folder), FOLDERS[name])
+                    files = filter(Path.is_file, sorted(islice(Path(folder).glob(FOLDERS[name]), MOST_FILES)))
+                    inside = (f"{file.relative_to(folder).as_posix()}\n{_digest(file)}" for file in files)
+                    found[folder] = hashlib.sha256("".join(inside).encode()).hexdigest()
                 if (parts or name in FILES) and Path(path).is_file():
                     found[path] = _digest(Path(path))
                 for part in parts:
                     if part != own and Path(part).is_file():
-                        found[os.path.join(os.path.dirname(path), os.path.relpath(part, os.path.dirname(own)))] = (
-                            _digest(Path(part))
-                        )
+                        beside = os.path.relpath(part, os.path.dirname(own))
+                        found[os.path.join(os.path.dirname(path), beside)] = _digest(Path(part))
     return found
 
 
 def _paths(value: object) -> Iterator[str]:
     """What may be a file in ``a.pt2,reference@weights.safetensors``, ``scene.glb#NODE`` or ``camera.csv+object.csv``,
     in lists and mappings."""
-    if isinstance(value, Mapping):
-        for one in value.values():
-            yield from _paths(one)
-    elif isinstance(value, (list, tuple)):
-        for one in value:
-            yield from _paths(one)
+    if isinstance(value, (Mapping, list, tuple)):
+        for inner in value.values() if isinstance(value, Mapping) else value:
+            yield from _paths(inner)
     elif isinstance(value, str):
         for name in value.split(","):
             parts = (name, name.rpartition("@")[2], name.partition("#")[0], *split_paths(name))
             yield from dict.fromkeys(one.strip() for one in parts if one.strip())
-
-
-def _digest_of_folder(folder: Path, which: str) -> str:
-    digest = hashlib.sha256()
-    for path in sorted(islice(folder.glob(which), MOST_FILES)):
-        if path.is_file():
-            digest.update(f"{path.relative_to(folder).as_posix()}\n{_digest(path)}".encode())
-    return digest.hexdigest()
 
 
 def _digest(path: Path) -> str:

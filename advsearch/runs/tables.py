@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, fields
+from dataclasses import fields
 from itertools import islice
 from math import prod
 from pathlib import Path
@@ -19,7 +19,7 @@ from pydantic.dataclasses import dataclass
 
 from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import FileFormatError
-from advsearch.runs.export import as_columns, as_record
+from advsearch.runs.export import as_columns, as_record, each_value
 from advsearch.runs.store import NAME, Row, Store
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -36,30 +36,20 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 
 @dataclass(frozen=True)
 class Units:
-    """How rows follow from draws.
+    """How rows follow from draws."""
 
-    Attributes:
-        sizes: of the axes of the grid, the last one fastest.
-        frames: place of the axis whose values are frames; None where there is none.
-        samples: draws at each point of the grid.
-        models: that are shown the same pictures.
-        again: pictures after which the draws come again; 0 for never.
-    """
-
-    sizes: tuple[Count, ...] = ()
-    frames: Annotated[int, Field(strict=True, ge=0)] | None = None
-    samples: Count = 1
-    models: Count = 1
-    again: Annotated[int, Field(strict=True, ge=0)] = 0
+    sizes: tuple[Count, ...] = ()  # of the axes of the grid, the last one fastest
+    frames: Annotated[int, Field(strict=True, ge=0)] | None = None  # place of the axis whose values are frames
+    samples: Count = 1  # draws at each point of the grid
+    models: Count = 1  # that are shown the same pictures
+    again: Annotated[int, Field(strict=True, ge=0)] = 0  # pictures after which the draws come again; 0 for never
 
     @property
     def size(self) -> int:
-        """Rows of a whole unit."""
         return self.models * (2 if self.again else 1) * (1 if self.frames is None else self.sizes[self.frames])
 
     @property
     def name(self) -> str:
-        """What one is called."""
         return "picture" if self.frames is None or self.sizes[self.frames] < 2 else "drive"
 
     def of(self, step: Number) -> Number:
@@ -77,11 +67,6 @@ class Units:
         before = place // (self.sizes[self.frames] * after)  # scenes are like one more axis, the slowest
         return (before * after + place % after) * self.samples + sample
 
-    @property
-    def noted(self) -> dict[str, Any]:
-        """What the note says."""
-        return asdict(self)
-
 
 def units_of(store: Store) -> Units | None:
     """Return what a run notes of its units; None where it notes nothing."""
@@ -96,7 +81,6 @@ def units_of(store: Store) -> Units | None:
 
 
 KIND = "sweep"  # rows of the sweep itself
-
 EDGES = "parts of ranges"
 """The note of a run that says where the range of each drawn parameter is cut: the ends of the parts, by name."""
 
@@ -164,14 +148,10 @@ def _cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
     said = row.id or number, row.step, row.correct, row.margin, row.probability, row.seconds
     label = row.label or ("" if row.correct is None else NOT_A_NUMBER)
     cells: dict[str, Any] = dict(zip(SAID, (*said, label), strict=True))
-    for name, described in row.values.items():
-        value: Any = described["value"]
-        called = f"parameter {name}" if name in TAKEN else name
-        several = isinstance(value, list)
-        for place, number_or_name in enumerate(value if several else [value]):
-            full = f"{called}[{place}]" if several else called
-            units.setdefault(full, described["unit"])
-            cells[full] = sys.intern(number_or_name) if isinstance(number_or_name, str) else number_or_name
+    for name, value, unit in each_value(row.values):
+        called = f"parameter {name}" if name.partition("[")[0] in TAKEN else name
+        units.setdefault(called, unit)
+        cells[called] = sys.intern(value) if isinstance(value, str) else value
     return cells
 
 

@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import Full, Queue
-from typing import Any, NamedTuple
+from typing import Any
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonObject
@@ -20,28 +20,15 @@ PACKAGES = {"mlflow": "mlflow", "tensorboard": "tensorboard.summary", "wandb": "
 """The trackers, and what of each is imported."""
 
 NUMBERS = ("objective", "score", "margin", "correct", "success", "probability")
-
 PATIENCE = 10.0  # seconds that the end of a run waits for what is still to be told
 WAITING = 10_000  # messages that may wait; further ones are not told
-
 LONGEST = 250
-
-PROJECT = "advsearch"
-
 _LOG = logging.getLogger("advsearch")
 
 MetricValues = Mapping[str, float]
 
 
-class Backend(NamedTuple):
-    """One tracker with an open run: `tell` takes numbers by name, of a step of their kind, and `close` ends the run."""
-
-    tell: Callable[[MetricValues, int], object]
-    close: Callable[[], object]
-
-
 def check_tracker(name: str | None) -> None:
-    """Check that a tracker can be told, before anything is done."""
     if name is None:
         return
     if name not in PACKAGES:
@@ -101,51 +88,36 @@ class Tracker:
 
     def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
         try:
-            backend = OPEN[self._name](_package(self._name), folder, settings)
+            tell, close = _opened(self._name, folder, settings)
             while (message := self._waiting.get()) is not None:
-                backend.tell(*message)
-            backend.close()
+                tell(*message)
+            close()
         except Exception as error:  # whatever a tracker does, the run goes on
             _LOG.warning("%s is told nothing more: %s", self._name, str(error)[:300] or type(error).__name__)
 
 
-# ---- the trackers ---------------------------------------------------------------------------------------------------
+def _opened(
+    name: str, folder: Path, settings: Mapping[str, str]
+) -> tuple[Callable[[MetricValues, int], object], Callable[[], object]]:
+    """Return what tells a tracker numbers by name, of a step of their kind, and what ends its run."""
+    package = _package(name)
+    if name == "mlflow":
+        package.start_run(run_name=folder.name, nested=True)
+        package.log_params(settings)
+        return lambda numbers, step: package.log_metrics(dict(numbers), step=step), package.end_run
+    if name == "tensorboard":  # its files are in the run, whose run.yaml has the settings
+        writer = package.Writer(str(folder / "artifacts" / "tensorboard"))
 
+        def add(numbers: MetricValues, step: int) -> None:
+            for each, value in numbers.items():
+                writer.add_scalar(each, value, step)
 
-def _mlflow(mlflow: Any, folder: Path, settings: Mapping[str, str]) -> Backend:
-    mlflow.start_run(run_name=folder.name, nested=True)
-    mlflow.log_params(settings)
+        return add, writer.close
+    run = package.init(project="advsearch", name=folder.name, config=dict(settings), reinit="create_new")
 
-    def tell(numbers: MetricValues, step: int) -> None:
-        mlflow.log_metrics(dict(numbers), step=step)
-
-    return Backend(tell, mlflow.end_run)
-
-
-def _tensorboard(summary: Any, folder: Path, settings: Mapping[str, str]) -> Backend:
-    """Event files in ``artifacts/tensorboard`` of the run; settings are in its run.yaml."""
-    writer = summary.Writer(str(folder / "artifacts" / "tensorboard"))
-
-    def tell(numbers: MetricValues, step: int) -> None:
-        for name, value in numbers.items():
-            writer.add_scalar(name, value, step)
-
-    return Backend(tell, writer.close)
-
-
-def _wandb(wandb: Any, folder: Path, settings: Mapping[str, str]) -> Backend:
-    """Each kind has steps of its own, which are told as a number: its one counter only ever goes up."""
-    run = wandb.init(project=PROJECT, name=folder.name, config=dict(settings), reinit="create_new")
-
-    def tell(numbers: MetricValues, step: int) -> None:
+    def log(numbers: MetricValues, step: int) -> None:
+        # each kind has steps of its own, which are told as a number: its one counter only ever goes up
         kind = next(iter(numbers), "rows/").partition("/")[0]
         run.log({**numbers, f"{kind}/step": step})
 
-    return Backend(tell, run.finish)
-
-
-OPEN: Mapping[str, Callable[[Any, Path, Mapping[str, str]], Backend]] = {
-    "mlflow": _mlflow,
-    "tensorboard": _tensorboard,
-    "wandb": _wandb,
-}
+    return log, run.finish

@@ -18,7 +18,7 @@ import numpy as np
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.files import MESHES, either
 from advsearch.scene.assets import Bools, EnvironmentAsset, Floats, Material, Mesh, ObjectAsset
-from advsearch.scene.importing.files import read_bytes, safe_name
+from advsearch.scene.importing.files import Notes, read_bytes, safe_name
 from advsearch.scene.importing.hdr import Plane, linear, read_exr, read_radiance
 from advsearch.scene.importing.pictures import area_average, banded_average
 from advsearch.scene.importing.ply import read_elements
@@ -90,7 +90,7 @@ def load_object(name: str) -> ObjectAsset:
         runs = facts.get("faces", ())  # how many faces in a row have which material
         names = np.repeat([name for name, _ in runs], [count for _, count in runs])
         materials = {str(name): np.nonzero(names == name)[0] for name in dict.fromkeys(names)}
-        elements, _ = read_elements(Path(name), (folder / "mesh.ply").read_bytes())
+        elements, _ = read_elements((folder / "mesh.ply").read_bytes(), Notes(name))
         vertex, faces = elements["vertex"].scalars, elements["face"].listed["vertex_indices"].values
         places, normals, uvs = (
             np.stack([vertex[number] for number in numbers], axis=1).astype(np.float32)

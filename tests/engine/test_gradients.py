@@ -15,15 +15,14 @@ from torch import Tensor
 from advsearch import load_scene
 from advsearch.controls import make_control
 from advsearch.engine.gradients import (
+    Bench,
     Estimate,
     Probe,
     Reference,
     agreement,
     attempts,
-    estimated,
     inside,
-    probes,
-    reference,
+    only,
     smooth_loss,
 )
 from advsearch.engine.planning import TELLS, contested, cosines, measured_plan, status_of, tuned
@@ -217,11 +216,11 @@ def test_a_texture_beside_a_pose_is_differentiated_once_and_nothing_geometric_fo
 def test_turning_an_environment_has_the_right_sign_and_size() -> None:
     """Mitsuba's own derivative of `to_world` has the wrong sign (docs/gradients.md); texels have the right one."""
     render = renderer(["environment.rotation"])
-    loss, u = smooth_loss((SIZE, SIZE)), inside(render)
-    names = [render.plan.groups[0].name]
-    adjoint = torch.stack([estimated(render, loss, u, "adjoint", names, seed, 128) for seed in range(6)]).mean()
-    (probe,) = probes(render, loss, u, 0, 16)
-    truth = reference(render, loss, u, probe, seed=0, spp=64)
+    bench = Bench(render, smooth_loss((SIZE, SIZE)), inside(render), seed=0, spp=64)
+    by_adjoint = only(render.plan, [render.plan.groups[0].name], "adjoint")
+    adjoint = torch.stack([replace(bench, spp=128).gradient(by_adjoint, seed) for seed in range(6)]).mean()
+    (probe,) = bench.probes()
+    truth = bench.reference(probe)
     assert float(adjoint) * truth.value > 0.0
     assert float(adjoint) == pytest.approx(truth.value, rel=0.1)
 
@@ -231,11 +230,11 @@ def test_turning_an_environment_has_the_right_sign_and_size() -> None:
 def test_the_adjoint_of_a_surface_agrees_with_differences_to_a_twentieth(parameter: str, share: float) -> None:
     """To a looser bound, with fewer samples, in tests/controls/test_control_material.py."""
     render = renderer({"material": {parameter: [0.1, 0.9]}})
-    loss, u = smooth_loss((SIZE, SIZE)), torch.tensor([share])
-    names = [render.plan.groups[0].name]
-    values = torch.stack([estimated(render, loss, u, "adjoint", names, seed, 128) for seed in range(6)]).flatten()
-    (probe,) = probes(render, loss, u, 0, 16)
-    truth = reference(render, loss, u, probe, seed=0, spp=256)
+    bench = Bench(render, smooth_loss((SIZE, SIZE)), torch.tensor([share]), seed=0, spp=256)
+    adjoint = only(render.plan, [render.plan.groups[0].name], "adjoint")
+    values = torch.stack([replace(bench, spp=128).gradient(adjoint, seed) for seed in range(6)]).flatten()
+    (probe,) = bench.probes()
+    truth = bench.reference(probe)
     doubt = 3.0 * math.hypot(float(values.std()) / math.sqrt(len(values)), truth.noise)
     assert doubt < 0.5 * abs(truth.value), "too noisy to say anything"
     assert float(values.mean()) == pytest.approx(truth.value, abs=0.05 * abs(truth.value) + doubt)
@@ -320,9 +319,8 @@ def test_a_reference_of_a_parabola_has_its_bias_taken_off() -> None:
 
     one = group("a.b", 0, 1, ("differences",), step=0.2)
     curve: Any = Curve()
-    found = reference(
-        curve, lambda image: image, torch.tensor([0.5]), Probe(one, "a.b", torch.ones(1), 0.2), seed=0, spp=1
-    )
+    bench = Bench(curve, lambda image: image, torch.tensor([0.5]), seed=0, spp=1)
+    found = bench.reference(Probe(one, "a.b", torch.ones(1), 0.2))
     assert found.value == pytest.approx(0.75, abs=1e-4)
     assert found.steps[0] == pytest.approx(0.75 + 0.04, abs=1e-4)
 
@@ -342,9 +340,8 @@ def test_a_reference_takes_wider_steps_where_narrow_ones_are_noise() -> None:
 
     def found(factors: Sequence[float]) -> Reference:
         curve: Any = Curve()
-        return reference(
-            curve, lambda image: image, torch.tensor([0.5]), probe, seed=0, spp=1, repeats=(6, 6), factors=factors
-        )
+        bench = Bench(curve, lambda image: image, torch.tensor([0.5]), seed=0, spp=1)
+        return bench.reference(probe, repeats=(6, 6), factors=factors)
 
     narrow, wide = found((1.0,)), found((1.0, 3.0, 9.0))
     assert narrow.noise > 0.1 and narrow.factor == 1.0 and narrow.renders == 24
@@ -372,14 +369,14 @@ def test_a_wider_step_of_one_gradient_leaves_the_plan_as_it_was() -> None:
         return image.sum()
 
     before = render.plan
-    estimated(render, loss, inside(render), "secant", ["pose.yaw"], 0, 1, 3.0)
+    Bench(render, loss, inside(render), seed=0, spp=1).gradient(only(before.with_steps(3.0), ["pose.yaw"], "secant"), 0)
     assert render.plan is before
     assert max(steps) == pytest.approx(3.0 * before.groups[0].step)
 
 
 def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> None:
     render = renderer({"environment": {"rotation": [0, 360], "exposure": [-1, 1]}})
-    plan = measured_plan(render, smooth_loss((SIZE, SIZE)), inside(render), seed=0, spp=4, repeats=2)
+    plan = measured_plan(Bench(render, smooth_loss((SIZE, SIZE)), inside(render), seed=0, spp=4), repeats=2)
     for one in plan.groups:
         assert set(one.measured) == {"adjoint", "differences"}
         assert one.estimator == min(one.measured, key=lambda name: one.measured[name])
@@ -391,7 +388,7 @@ def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> No
 def test_a_loss_that_is_flat_keeps_what_is_preferred() -> None:
     """As of a detector that sees nothing with the right name: all gradients are nil, and none has an error."""
     render = renderer({"environment": {"exposure": [-1, 1]}})
-    plan = measured_plan(render, lambda image: 0.0 * image.sum(), inside(render), seed=0, spp=2, repeats=2)
+    plan = measured_plan(Bench(render, lambda image: 0.0 * image.sum(), inside(render), seed=0, spp=2), repeats=2)
     (one,) = plan.groups
     assert set(one.measured.values()) == {0.0}
     assert (one.estimator, one.reason) == (
@@ -426,22 +423,26 @@ class Told:
         return torch.zeros(()), torch.tensor(told[self.asked.count(spp) % len(told)])
 
 
+def bench_of(renderer: Any) -> Bench:
+    return Bench(renderer, lambda image: image, torch.zeros(2), seed=0, spp=1)
+
+
 def test_converged_gradients_of_which_one_disagrees_get_more_samples() -> None:
     """Two of three agree to 1 here, as they do by luck where there are few numbers."""
     right, wrong = [1.0, 0.0], [-1.0, 0.1]
     told: Any = Told({128: [right, right, wrong], 512: [right], 8: [right]})
-    (row,) = cosines(told, lambda image: image, torch.zeros(2), seed=0, counts=(8,))
+    (row,) = cosines(bench_of(told), counts=(8,))
     assert told.asked == [128, 128, 128, 512, 512, 512, 8, 8, 8]
     assert (row.status, row.cosine, row.reference_cosine) == ("ok", 1.0, 1.0)
     agreed: Any = Told({128: [right], 8: [right]})
-    list(cosines(agreed, lambda image: image, torch.zeros(2), seed=0, counts=(8,)))
+    list(cosines(bench_of(agreed), counts=(8,)))
     assert 512 not in agreed.asked
 
 
 def test_a_working_gradient_is_not_held_against_one_of_fewer_samples() -> None:
     right, across = [1.0, 0.0], [0.0, 1.0]
     told: Any = Told({128: [across], 512: [right], 64: [right], 256: [right]})
-    dear = cosines(told, lambda image: image, torch.zeros(2), seed=0, counts=(64, 256))
+    dear = cosines(bench_of(told), counts=(64, 256))
     assert [(row.spp, row.cosine) for row in dear] == [(64, 0.0), (256, 1.0)]
 
 
@@ -451,8 +452,7 @@ def test_the_widest_step_is_tried_only_where_no_other_will_do() -> None:
     def factors(working: list[list[float]], step: float = 0.01) -> list[float]:
         told: Any = Told({128: [right], 8: working})
         told.plan = first_plan((group("pose.x", 0, 2, ("secant",)),), torch.tensor([step, step]))
-        rows = cosines(told, lambda image: image, torch.zeros(2), seed=0, counts=(8,))
-        return [row.factor for row in rows]
+        return [row.factor for row in cosines(bench_of(told), counts=(8,))]
 
     assert factors([right]) == [1.0, 3.0]
     assert factors([across]) == [1.0, 3.0, 9.0]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 import torch
 
-from advsearch.engine.judging import KnownTruths
+from advsearch.engine.problem import Problem
 from advsearch.tasks import Facts
 
 
@@ -38,9 +39,9 @@ def test_a_truth_is_remembered_where_only_base_colours_differ(route: str, asks: 
         seen.append(float(cast(Any, facts.sight)[1]))
         return seen[-1]
 
-    task = SimpleNamespace(truth=truth)
-    given = cast(Any, (task, space, renderer, lambda describe, look: Facts("x", describe=describe, look=look)))
-    truths = KnownTruths(*given)
+    task = SimpleNamespace(truth=truth, varies=True)
+    problem = object.__new__(Problem)
+    vars(problem).update(task=task, space=space, renderer=renderer, facts=partial(Facts, "x", None, None), _truths={})
     asked = [(0.1, 0.5), (0.2, 0.5), (0.1, 0.7), (0.1, 0.7)]
-    found = [truths.at(torch.tensor(one)) for one in asked]
+    found = [problem.truth(torch.tensor(one)) for one in asked]
     assert found == pytest.approx([0.5, 0.5, 0.7, 0.7]) and len(seen) == looked

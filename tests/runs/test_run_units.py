@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 
@@ -40,7 +41,7 @@ def test_without_frames_a_unit_is_a_picture() -> None:
 def test_a_run_notes_its_units_and_what_is_none_is_refused(tmp_path: Path) -> None:
     with Store(tmp_path / STORE) as store:
         assert units_of(store) is None
-        store.set_note(NOTE, json.dumps(Units((3, 5), 1, 2, 2, 60).noted))
+        store.set_note(NOTE, json.dumps(asdict(Units((3, 5), 1, 2, 2, 60))))
         assert units_of(store) == Units((3, 5), 1, 2, 2, 60)
         for text in ("[]", '{"sizes": 3}', '{"sizes": [3], "models": 0}', '{"sizes": ["a"]}'):
             store.set_note(NOTE, text)

@@ -113,7 +113,7 @@ def test_rows_are_added_all_or_none(run: RunDirectory) -> None:
 def test_kinds_are_counted_and_read_apart(run: RunDirectory) -> None:
     run.record(Row("search", 0, objective=1.0), Row("baseline", 0, objective=5.0), Row("search", 1, objective=math.nan))
     assert (run.store.count(), run.store.count("search"), run.store.count("sweep")) == (3, 2, 0)
-    assert run.store.curve("search") == [(0, 1.0), (1, None)]
+    assert [(row.step, row.objective) for row in run.store.rows("search")] == [(0, 1.0), (1, None)]
     assert [row.objective for row in run.store.rows("baseline")] == [5.0]
 
 
@@ -329,7 +329,7 @@ def test_a_run_that_fails_later_keeps_what_it_has(tmp_path: Path, keep: str) -> 
 GONE_ON: dict[str, Callable[[RunDirectory], object]] = {
     "record": lambda run: run.record(Row("search", 1)),
     "write_summary": lambda run: run.write_summary(attack()),
-    "finish": lambda run: run.finish(),
+    "forget": lambda run: run.store.forget(),
     "set_note": lambda run: run.store.set_note("a", "b"),
     "save_image": lambda run: run.save_image("clean", np.zeros((2, 2, 3))),
     "write_bytes": lambda run: write_bytes(run.path / "images" / "figure.svg", b"<svg/>"),

@@ -65,7 +65,7 @@ def test_its_own_page_is_shown_when_it_has_ended(tmp_path: Path) -> None:
             assert len(json.load(answer)["rows"]) == 1
         (path / "report.html").write_text("what came out")
         assert is_under_way(path)  # an attack that is resumed has the page of its first sitting
-        run.finish()
+        run.store.forget()
         assert not is_under_way(path) and news(path)["ended"]
         with urlopen(address) as answer:
             assert answer.read().endswith(b"what came out")

@@ -18,7 +18,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import check_options
 from advsearch.registry import Registry
 
-INSIDE = ("choices", "stay")  # policies that only the search asks for
+INSIDE = ("choices",)  # policies that only the search asks for
 
 
 def _own() -> dict[str, type[Policy[Any]]]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from advsearch.attacks.candidates import Failures, FoundFailure, most_different
 from advsearch.attacks.domain import Domain, half_widths, wraps
 from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
-from advsearch.attacks.policies.surrogate import MOST_OWN, Coordinates, Observed, Surrogate, box_coordinates
+from advsearch.attacks.policies.surrogate import MOST_OWN, Observed, Surrogate, box_coordinates
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream
 
@@ -24,7 +24,6 @@ MOST_CELLS = 1_000_000  # an archive has no more
 MOST_SPANNED = 4  # parameters that span it; with more, nearly every configuration has a cell of its own
 ANEW = 0.1  # share of the configurations, and of the discrete choices, that are drawn anew
 TOURNAMENT = 4  # so many kept configurations are drawn, and the one with the largest objective is changed
-
 SIGMA, LINE = 0.1, 0.3
 """Standard deviations of a step, in half of each number's range, and of one along the line through two configurations,
 in their distance."""
@@ -82,13 +81,6 @@ class ArchiveState:
             if block.options:
                 points[:, part] = torch.where(anew[:, part], samples[:, part], first[:, part])
         return points
-
-    def candidates(self, box: Coordinates, rng: torch.Generator) -> Tensor:
-        """Return (n, d) configurations of a box to choose from: bred ones, some of which are moved to any cell."""
-        samples = box.low + box.width * torch.rand(CANDIDATES, box.count, generator=rng)
-        points, moved = self.bred(samples, rng), int(ELSEWHERE * CANDIDATES)
-        points[:moved, self.spanned] = samples[:moved, self.spanned]
-        return box.put(points, box.tidy((points - box.low) / box.width))
 
     def likeliest(self, surrogate: Surrogate, points: Tensor, count: int) -> Tensor:
         """Return (count, d) of the candidates (n, d), of different cells as long as there are: those that most likely
@@ -164,15 +156,11 @@ class MapElites(Policy[ArchiveState]):
         from ribs import archives  # an extra, and it takes seconds
 
         archive = archives.GridArchive(
-            solution_dim=domain.dim,
-            dims=dims,
+            solution_dim=domain.dim, dims=dims, seed=stream(seed, "archive"),
             ranges=list(zip(domain.lower[spanned].tolist(), domain.upper[spanned].tolist(), strict=True)),
-            seed=stream(seed, "archive"),
-            solution_dtype=np.float32,
-            objective_dtype=np.float64,
-            measures_dtype=np.float64,
+            solution_dtype=np.float32, objective_dtype=np.float64, measures_dtype=np.float64,
             extra_fields={"wrong": ((), np.bool_)},
-        )
+        )  # fmt: skip
         first = [domain.begin[None], domain.sample(seeded(seed, 0), self.population - 1)]
         box = box_coordinates(domain)
         few = box.count == domain.dim <= MOST_OWN
@@ -213,11 +201,16 @@ class MapElites(Policy[ArchiveState]):
         anew = int((torch.rand(self.population, generator=rng) < ANEW).sum())
         samples, seen = state.domain.sample(rng, self.population), state.seen
         if seen is None:
-            bred = [state.domain.project(u) for u in state.bred(samples[anew:], rng)]
-            return replace(state, points=torch.stack([*samples[:anew], *bred]))
+            children = [state.domain.project(u) for u in state.bred(samples[anew:], rng)]
+            return replace(state, points=torch.stack([*samples[:anew], *children]))
         with one_thread():
             surrogate, seen = seen.surrogate()
-            points = state.likeliest(surrogate, state.candidates(seen.space, rng), self.population - anew)
+            box, moved = seen.space, int(ELSEWHERE * CANDIDATES)
+            drawn = box.low + box.width * torch.rand(CANDIDATES, box.count, generator=rng)
+            bred = state.bred(drawn, rng)
+            bred[:moved, state.spanned] = drawn[:moved, state.spanned]  # to any cell
+            candidates = box.put(bred, box.tidy((bred - box.low) / box.width))
+            points = state.likeliest(surrogate, candidates, self.population - anew)
         return replace(state, points=torch.cat([samples[:anew], points]), seen=seen)
 
     def _spanned(self, domain: Domain) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -30,7 +30,6 @@ from advsearch.errors import InputError
 
 SCREEN, SCREEN_MIXED = 0.5, 0.25  # share of the renders that the screen takes, in a box alone and beside a norm ball
 UNTIL, UNTIL_MIXED = 0.75, 0.5  # share of the renders after which an ascent takes over, if there is one
-
 LOW = 10
 """Up to so many box coordinates are worth the whole screen. Of more it sees less and less, so if gradients cost nothing
 its share shrinks in proportion and the ascent follows at once."""
@@ -40,7 +39,6 @@ PAYS = 4
 into the ascent. One by differences never is: half a number for each, and the surrogate was better on average."""
 
 REACH = 0.1  # the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else
-
 MOMENTUM, MOMENTUM_DRAWN = 0.75, 0.95
 """Weight of past gradients where none has noise and all point the same way, and where each sees other conditions; with
 noise PGD's own is better."""
@@ -65,7 +63,6 @@ class Spending:
 
 
 def make_plan(domain: Domain, box: Coordinates, steps: int) -> Spending:
-    """Return what `steps` renders are for."""
     if box.count == 0:
         return Spending(steps, 0, 0, True)
     if box.count < domain.dim:
@@ -86,18 +83,11 @@ def _pgd(domain: Domain) -> PGD:
     return PGD(momentum=MOMENTUM) if domain.exact else PGD()
 
 
-class Tried(NamedTuple):
-    """A random move of the box coordinates during an ascent: where they stood, and the objective there."""
-
-    x: Tensor
-    objective: float
-
-
 @dataclass(frozen=True, eq=False)
 class AutoState:
     """Where the search stands: where the screened box coordinates have been, with norm balls at their start, where the
     screen (m, k) looks next, the renders spent, and, once it has begun, the ascent of PGD, its latest objective and
-    what the latest proposal tried, if it did."""
+    where the box coordinates stood before the latest proposal moved them at random, if it did (`trial`)."""
 
     domain: Domain
     seen: Observed
@@ -108,7 +98,7 @@ class AutoState:
     ascent: Ascent | None = None
     climbing: bool = False
     last: float = -math.inf
-    trial: Tried | None = None
+    trial: Tensor | None = None
 
     @property
     def box(self) -> Coordinates:
@@ -159,7 +149,15 @@ class Auto(Policy[AutoState]):
         if state.ascent is not None:
             steps, ascent = _pgd(state.domain).propose(state.ascent, n)
             if steps:
-                return self._climb(replace(state, climbing=True), ascent, steps[0])
+                (proposal,) = steps
+                proposal, state = replace(proposal, gradient=state.plan.gradient), replace(state, climbing=True)
+                if proposal.gradient is True or ascent.count % 2 == 0:
+                    return (proposal,), state
+                # only the balls have a gradient, so every second one moves in the box too
+                box, x = state.box, state.box.take(proposal.u)
+                moved = box.moves(x[None], seeded(state.seed, state.plan.steps + ascent.count))[0]
+                u = state.domain.project(box.put(proposal.u, moved))
+                return (replace(proposal, u=u),), replace(state, trial=x)
             if state.box.count < state.domain.dim:
                 return (), state
         done = len(state.seen.values)
@@ -174,10 +172,10 @@ class Auto(Policy[AutoState]):
     def update(self, state: AutoState, evaluated: Evaluated) -> AutoState:
         state = replace(state, spent=state.spent + sum(evaluation.cost for _, evaluation in evaluated))
         if state.climbing and state.ascent is not None:
-            ((u, evaluation),) = evaluated
+            ((_, evaluation),) = evaluated
             ascent = _pgd(state.domain).update(state.ascent, evaluated)
-            if state.trial is not None and evaluation.objective < state.trial.objective:
-                u = state.domain.project(state.box.put(ascent.u, state.trial.x))
+            if state.trial is not None and evaluation.objective < state.last:
+                u = state.domain.project(state.box.put(ascent.u, state.trial))
                 ascent = replace(ascent, u=u, counts=ascent.counts + Counts(rejected=1))
             return replace(state, ascent=ascent, last=evaluation.objective)
         return replace(state, seen=state.seen.extended(evaluated))
@@ -190,7 +188,6 @@ class Auto(Policy[AutoState]):
         return NO_COUNTS if state.ascent is None else state.ascent.counts
 
     def _next_point(self, state: AutoState) -> tuple[Tensor, AutoState]:
-        """Return what the surrogate likes best: (k,) in the unit box."""
         box, generator = state.box, seeded(state.seed, len(state.seen.values))
         if not state.seen.finite:
             return box.tidy(torch.rand(box.count, generator=generator)), state
@@ -215,16 +212,6 @@ class Auto(Policy[AutoState]):
         domain = replace(state.domain, blocks=tuple(shortened))
         ascent = _pgd(domain).start(domain, seeded(state.seed, 0), max(1, state.plan.steps - state.spent))
         return replace(state, ascent=replace(ascent, u=state.at(x)))
-
-    def _climb(self, state: AutoState, ascent: Ascent, proposal: Proposal) -> tuple[tuple[Proposal, ...], AutoState]:
-        """Return the ascent's proposal; every second one moves in the box too, where only the balls have a gradient."""
-        proposal = replace(proposal, gradient=state.plan.gradient)
-        if proposal.gradient is True or ascent.count % 2 == 0:
-            return (proposal,), state
-        x = state.box.take(proposal.u)
-        moved = state.box.moves(x[None], seeded(state.seed, state.plan.steps + ascent.count))[0]
-        u = state.domain.project(state.box.put(proposal.u, moved))
-        return (replace(proposal, u=u),), replace(state, trial=Tried(x, state.last))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from heapq import heapify, heappop, heappush
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -18,6 +17,7 @@ from torch import Tensor
 from advsearch.attacks.candidates import Failures
 from advsearch.attacks.domain import Block, Distribution, Domain, centre_of_option
 from advsearch.attacks.evaluation import NO_COUNTS, Counts, Evaluated, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.sampling import Random
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,50 +63,38 @@ class Race:
 
     def asking(self: Racing, n: int) -> tuple[tuple[Proposal, ...], Racing]:
         """Return up to n proposals of this round that do not wait for each other; none where it is done."""
-        runners, field = list(self.runners), self.field
-        queue = _queue(runners, field)
-        each = -(-n // max(1, len(queue)))
+        runners, waiting = list(self.runners), [k for k in self.field if self.runners[k].left]
+        each = -(-n // max(1, len(waiting)))
         proposals, taken = dict[int, tuple[Proposal, ...]](), Counter[int]()
         batch, asked = list[Proposal](), list[int]()
-        while queue and len(batch) < n:
-            _, place = queue[0]
-            k = field[place]
+        while waiting and len(batch) < n:
+            k = max(waiting, key=lambda k: runners[k].left)  # the first of equals
             runner = runners[k]
             if k not in proposals:
                 proposals[k], state = runner.policy.propose(runner.state, min(each, runner.left))
                 runner = replace(runner, state=state)
             if not proposals[k]:
                 # take out a search that has nothing more to propose; its share is for those left in the round
-                share, runners[k] = runners[k].left, replace(runners[k], left=0, over=True)
-                others = [other for other in field if not runners[other].over]
+                runners[k] = replace(runners[k], left=0, over=True)
+                others = [other for other in self.field if not runners[other].over]
                 for other in others:
-                    runners[other] = replace(runners[other], left=runners[other].left + share // len(others))
-                queue = _queue(runners, field)
-                continue
-            if taken[k] == len(proposals[k]):  # what it proposes next, these evaluations say
+                    runners[other] = replace(runners[other], left=runners[other].left + runner.left // len(others))
+            elif taken[k] == len(proposals[k]):  # what it proposes next, these evaluations say
                 break
-            wanted = proposals[k][taken[k]]
-            capped = replace(wanted, samples=min(runner.left, wanted.samples))
-            later = self.round + 1 < self.rounds  # there will be renders to use a gradient
-            batch.append(capped.affordable(runner.domain, runner.left + later))
-            asked.append(k)
-            taken[k] += 1
-            runners[k] = replace(runner, left=runner.left - batch[-1].cost(runner.domain))
-            heappop(queue)
-            if runners[k].left:
-                heappush(queue, (-runners[k].left, place))
+            else:
+                wanted = proposals[k][taken[k]]
+                capped = replace(wanted, samples=min(runner.left, wanted.samples))
+                later = self.round + 1 < self.rounds  # there will be renders to use a gradient
+                batch.append(capped.affordable(runner.domain, runner.left + later))
+                asked.append(k)
+                taken[k] += 1
+                runners[k] = replace(runner, left=runner.left - batch[-1].cost(runner.domain))
+            waiting = [k for k in self.field if runners[k].left]
         for k, count in taken.items():
             if count < len(proposals[k]):  # it shall not count on more than was taken
                 _, state = runners[k].policy.propose(self.runners[k].state, count)
                 runners[k] = replace(runners[k], state=state)
         return tuple(batch), replace(self, runners=tuple(runners), asked=tuple(asked))
-
-
-def _queue(runners: Sequence[Runner], field: Sequence[int]) -> list[tuple[int, int]]:
-    """Return a heap of places in the field, first that of whoever has most left: the first of equals."""
-    queue = [(-runners[k].left, place) for place, k in enumerate(field) if runners[k].left]
-    heapify(queue)
-    return queue
 
 
 def count_rounds(runners: int) -> int:
@@ -170,7 +158,6 @@ class Raced(Policy[Racing]):
         return replace(state, runners=tuple(runners), spent=spent, asked=())
 
     def distribution(self, state: Racing) -> Distribution | None:
-        """Return the leader's distribution, if it has one."""
         runner = state.runners[state.leader]
         return runner.policy.distribution(runner.state)
 
@@ -181,24 +168,6 @@ class Raced(Policy[Racing]):
 
     def counts(self, state: Racing) -> Counts:
         return sum((runner.policy.counts(runner.state) for runner in state.runners), NO_COUNTS)
-
-
-@dataclass(frozen=True)
-class Stay(Policy[Tensor]):
-    """Proposes the configuration where it began, again and again; its state is that configuration. For wrappers."""
-
-    name: ClassVar[str] = "stay"
-    uses_gradient: ClassVar[bool] = False
-    handles_choices: ClassVar[bool] = True
-
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Tensor:
-        return domain.begin
-
-    def propose(self, state: Tensor, n: int) -> tuple[tuple[Proposal, ...], Tensor]:
-        return (Proposal(state),) * n, state
-
-    def update(self, state: Tensor, evaluated: Evaluated) -> Tensor:
-        return state
 
 
 MOST = 256  # no more combinations than this take part
@@ -216,7 +185,6 @@ class ChoicesState(Race):
     combinations: Tensor
 
     def whole(self, numbers: Tensor, combination: int) -> Tensor:
-        """Return the configuration (d,) of these numbers, beside a combination of options."""
         u = self.domain.begin.clone()
         u[self.numbers] = numbers[: len(self.numbers)]
         u[self.choices] = self.combinations[combination]
@@ -247,13 +215,12 @@ class Choices(Raced[ChoicesState]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> ChoicesState:
         seed, options = draw_seed(generator), domain.options
         numbers, choices = (options == 0).nonzero().flatten(), options.nonzero().flatten()
-        policy, inner = self.policy, _EMPTY
+        policy: Policy[Any] = Random()  # of one number that is dropped, where nothing but choices may vary
+        inner = Domain(torch.zeros(1), (Block(1),))
         if len(numbers):
             first = None if domain.first is None else domain.first[numbers]
             blocks = tuple(block for block in domain.blocks if not block.options)
-            inner = replace(domain, start=domain.start[numbers], blocks=blocks, first=first)
-        else:
-            policy = Stay()
+            policy, inner = self.policy, replace(domain, start=domain.start[numbers], blocks=blocks, first=first)
         counts = options[choices].tolist()
         each = 1 + (domain.gradient_cost if policy.uses_gradient else 0)
         limit = min(MOST, math.prod(counts), max(2, MOST_NUMBERS // domain.dim))
@@ -292,12 +259,8 @@ def with_choices(policy: Policy[Any], domain: Domain) -> Policy[Any]:
     return Choices(policy) if discrete and not policy.handles_choices else policy
 
 
-_EMPTY = Domain(torch.zeros(1), (Block(1),))  # stands in where nothing but choices may vary; its one number is dropped
-
-
 def _combinations(counts: list[int], begin: Tensor, most: int, generator: torch.Generator) -> Tensor:
-    """Return (n, c) elements of u, n at most `most`, that of the start first and unchanged: all combinations in a
-    random order, or so many distinct ones."""
+    """Return (n, c) elements of u, that of the start first: all combinations in a random order, or `most` of them."""
     sizes, total = torch.tensor(counts), math.prod(counts)
     start = torch.floor(begin * sizes).long().clamp(max=sizes - 1)
     if total <= max(1024, 4 * most):

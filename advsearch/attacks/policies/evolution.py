@@ -26,7 +26,6 @@ FULL = 80
 size from which the linear algebra would use several threads, whose last bits may differ."""
 
 MOST = 10_000  # more numbers are refused: a generation would take longer than renders, and an ascent is far ahead
-
 WIDEST, NARROWEST = 10.0, 1e-3
 """In half ranges: the step size grows no further (it does where all objectives are equal), and a run is over when its
 largest deviation is no more than this."""
@@ -174,12 +173,10 @@ class CMAESState:
 
     @property
     def deviations(self) -> Doubles:
-        """(d,) of the distribution, in half ranges."""
         return np.asarray(self.strategy.stds, dtype=np.float64)
 
     @property
     def distribution(self) -> Distribution:
-        """The distribution that this run has reached."""
         mean, _ = self.projected(np.asarray(self.strategy.mean))
         return Distribution(mean, torch.from_numpy(self.deviations).float() * self.scale)
 
@@ -198,7 +195,6 @@ class CMAESState:
         return replace(self, generation=number, points=points, values=(), outside=())
 
     def tell(self) -> CMAESState:
-        """Let a copy of the strategy learn from a whole generation."""
         values, spread = np.array(self.values), 0.0
         finite = np.isfinite(values)
         if finite.any():
@@ -292,11 +288,9 @@ class CMAES(Policy[CMAESState]):
         return state.distribution
 
     def _strategy(self, d: int, population: int, seed: int) -> Any:
-        """Return pycma's object for a run, before its first generation."""
         options = {"CMA_diagonal": d > FULL, "popsize": population, "randn": _normal, "seed": math.nan}
         options |= {"signals_filename": "", "verbose": -9, "verb_log": 0}
         with _own_random(seed, 0):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                import cma  # takes most of a second, and complains where there is no matplotlib
+            import cma  # takes most of a second, and complains where there is no matplotlib
+
             return cma.CMAEvolutionStrategy(np.zeros(d), self.sigma, options)

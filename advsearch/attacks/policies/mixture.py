@@ -15,20 +15,16 @@ from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed,
 from advsearch.errors import InputError
 
 MOST = 50  # more numbers are refused: there would never be enough draws to learn from
-
 WINDOW = 1000
-
 ELITE, FEWEST = 0.1, 10
 """Where fewer draws failed, those with the largest objectives stand in for failures: a tenth of them, ten at least."""
 
 ROUNDS = 8
-
 EVEN, PRIOR = 12**-0.5, 3.0
 """Deviation of the even distribution in shares of a range; it counts for so many draws of each component, so that what
 does not matter stays wide."""
 
 NARROWEST, FLAT = 0.02, 10.0  # deviations of a number, in shares of its range, at least and at most
-
 TELLING = 0.5
 """A number tells a component apart where its deviation is under so much of the even one's; an option, where it has more
 than so much of the probability."""
@@ -48,7 +44,6 @@ class Ranges:
         return torch.where(self.around, torch.remainder(plain + 0.5, 1.0) - 0.5, plain)
 
     def ends(self, mean: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the ends of the ranges as they lie from a mean."""
         half = torch.full_like(mean, 0.5)
         return torch.where(self.around, -half, -mean), torch.where(self.around, half, 1.0 - mean)
 
@@ -124,7 +119,6 @@ class MixtureState:
     told: int = 0
 
     def configuration(self, x: Tensor) -> Tensor:
-        """Return the configuration (d,) for shares x of the ranges."""
         return self.domain.project((self.domain.lower + x * (self.domain.upper - self.domain.lower)).float())
 
     def telling(self, mixture: Components, k: int) -> dict[int, tuple[float, float]]:
@@ -227,8 +221,6 @@ class Mixture(Policy[MixtureState]):
             share = failure_share(state.log[:, 3], state.log[:, 4], state.log[:, 1] > 0, state.log[:, 2] > 0)
         found = int((state.log[:, 1] * (1.0 - state.log[:, 2])).sum())
         return Failures(tuple(listed), (), found, len(state.log), None, share if whole else None)
-
-    # ---- generations ------------------------------------------------------------------------------------------------
 
     def _drawn(self, state: MixtureState, mixture: Components | None) -> MixtureState:
         """Begin the next generation: its draws come from the mixture, and some of them are even."""

@@ -254,32 +254,21 @@ class PGD(Climbing):
             state = replace(state, first=objective)
         if state.domain.drawn:
             return self._moved(state, u)
-        state = replace(state, window=state.window.add(objective))
-        if len(state.window.values) < state.window.length:
-            return self._moved(state, u)
-        return self._slower(state, u) if state.domain.exact else self._checkpoint(state, u)
-
-    def _checkpoint(self, state: Ascent, u: Tensor) -> Ascent:
-        """Halve the step size if the window has stalled, and go on from the best configuration if it lags behind."""
-        window, peak = state.window, state.peak
+        window, peak, slower = state.window.add(objective), state.peak, replace(state, step_size=state.step_size / 2)
+        if len(window.values) < window.length:
+            return self._moved(replace(state, window=window), u)
+        if state.domain.exact:  # (the best of all may stem from another matrix of light transport)
+            best = max(window.values)
+            idle = best - window.best <= GAIN * (best - state.first)
+            state = replace(slower, idle=state.idle + 1) if idle else replace(state, idle=0)
+            return self._moved(replace(state, window=Window(window.length, best=best)), u)
         best = peak.objective if peak else -math.inf
         stalled = window.stalled(best)
-        if stalled:
-            state = replace(state, step_size=state.step_size / 2)
+        state = slower if stalled else state
         if peak is not None and stalled and window.lags(best):
             u = peak.u
             state = replace(state, direction=peak.direction, counts=state.counts + Counts(rejected=1))
         return self._moved(replace(state, window=window.next(state.steps, best, stalled)), u)
-
-    def _slower(self, state: Ascent, u: Tensor) -> Ascent:
-        """Without noise: halve the step size where the window added nothing to the one before. (The best of all may
-        stem from another matrix of light transport.)"""
-        window, best = state.window, max(state.window.values)
-        idle = best - window.best <= GAIN * (best - state.first)
-        if idle:
-            state = replace(state, step_size=state.step_size / 2)
-        window = Window(window.length, best=best)
-        return self._moved(replace(state, idle=state.idle + 1 if idle else 0, window=window), u)
 
     def _moved(self, state: Ascent, u: Tensor) -> Ascent:
         """Move from u along the accumulated gradient, or at random where there is none."""

@@ -155,7 +155,14 @@ class Grid(Unlearning):
                 low[part] = low[part].maximum(domain.start[part] - block.epsilon)
                 high[part] = high[part].minimum(domain.start[part] + block.epsilon)
         blocks = [block for block in domain.blocks for _ in range(block.size)]
-        axes = map(_axis, blocks, counts, low.tolist(), high.tolist())
+        axes = []
+        for block, count, least, most in zip(blocks, counts, low.tolist(), high.tolist(), strict=True):
+            if block.options:
+                axes.append((torch.arange(count) + 0.5) / count)
+            elif block.periodic:  # its end is its beginning and comes once
+                axes.append(least + (most - least) * torch.arange(count) / count)
+            else:
+                axes.append(torch.linspace(least, most, count))
         points = torch.cartesian_prod(*axes).reshape(-1, domain.dim)
         # coarse to fine: by the largest, then the sum of the levels of a point, whose last axis runs fastest
         largest = total = torch.zeros(1, dtype=torch.long)
@@ -170,7 +177,6 @@ class Grid(Unlearning):
 
 
 def _counts(domain: Domain, steps: int, points: int) -> list[int]:
-    """Return how many values each element of u takes."""
     options = domain.options.tolist()
     numbers, combinations = options.count(0), math.prod(n for n in options if n)
     least = combinations * (points or 2) ** min(numbers, 64)
@@ -191,15 +197,6 @@ def _counts(domain: Domain, steps: int, points: int) -> list[int]:
                 total, grew = total // counts[j] * (counts[j] + 1), True
                 counts[j] += 1
     return counts
-
-
-def _axis(block: Block, count: int, low: float, high: float) -> Tensor:
-    """Return (count,) evenly spaced values; an angle's end is its beginning and comes once."""
-    if block.options:
-        return (torch.arange(count) + 0.5) / count
-    if block.periodic:
-        return low + (high - low) * torch.arange(count) / count
-    return torch.linspace(low, high, count)
 
 
 def _levels(block: Block, count: int) -> Tensor:

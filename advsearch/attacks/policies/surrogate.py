@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from advsearch.attacks.domain import Domain, centre_of_option
+from advsearch.attacks.domain import Domain, centre_of_option, wraps
 from advsearch.attacks.evaluation import Evaluated, seeded
 
 MOST_SOBOL = 1000  # more coordinates than this are screened with independent points; Sobol's advantage is long gone
@@ -91,16 +91,10 @@ class Coordinates:
 
 def box_coordinates(domain: Domain) -> Coordinates:
     """Return the coordinates of a domain that belong to no norm ball; there may be none."""
-    whole = [(block, part) for block, part in domain.parts() if block.norm == "box"]
-    boxes = [(block, place) for block, part in whole for place in range(part.start, part.stop)]
-    low, high = (torch.tensor([getattr(block, name) for block, _ in boxes]) for name in ("low", "high"))
-    return Coordinates(
-        where=torch.tensor([place for _, place in boxes], dtype=torch.long),
-        low=low,
-        width=high - low,
-        periodic=torch.tensor([block.periodic for block, _ in boxes], dtype=torch.bool),
-        options=torch.tensor([block.options for block, _ in boxes], dtype=torch.long),
-    )
+    boxes = [torch.arange(part.start, part.stop) for block, part in domain.parts() if block.norm == "box"]
+    where = torch.cat([torch.empty(0, dtype=torch.long), *boxes])
+    low, width = domain.lower[where], domain.upper[where] - domain.lower[where]
+    return Coordinates(where, low, width, wraps(domain)[where], domain.options[where])
 
 
 LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)

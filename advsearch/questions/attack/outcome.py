@@ -68,7 +68,7 @@ def summarise(
             "objective": objective or problem.task.objective,
             "warnings": [*warnings, *_remarks(findings, problem, journal)],
             "drive": drive,
-            "shared": SharedWork.of_facts(journal.traced.facts, journal.machines.known),
+            "shared": SharedWork.of_facts(journal.traced.facts, journal.machines),
             "seconds": {**stages.seconds, "total": stages.total},
             **_asked(problem),
             **_seen(problem, findings, clean, adversarial),
@@ -78,7 +78,7 @@ def summarise(
     if run is not None:
         keep_result(run, summary)
         if not findings.interrupted:
-            run.finish()
+            run.store.forget()
     path = None if run is None else run.path
     return AttackResult(
         summary, path, u, clean.picture, adversarial.picture, artifacts, search, in_memory=tuple(journal.rows)
@@ -327,7 +327,7 @@ def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str
     searches = [search.non_finite_elements for search in (findings.search, findings.baseline) if search is not None]
     if not_finite := max(problem.renderer.non_finite, sum(searches)):  # what predicts pictures has no such count
         remarks.append(f"{not_finite} values of pictures or gradients were not finite and were set to 0.")
-    return [*remarks, *lost_remarks(journal.lost), *journal.machines.remarks]
+    return [*remarks, *lost_remarks(journal.lost), *journal.remarks]
 
 
 def described_failures(problem: Problem, findings: Findings) -> DifferentFailures | None:

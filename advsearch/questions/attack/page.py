@@ -41,7 +41,7 @@ def page(run: Path, result: Result) -> str | None:
     frames, curves = _read_frames(run / directory.IMAGES / "search.gif"), {}
     if (run / store.NAME).is_file():
         with store.Store(run / store.NAME, read_only=True) as stored:
-            curves = {kind: [value for _, value in stored.curve(kind)] for kind in ("search", "baseline")}
+            curves = {kind: [row.objective for row in stored.rows(kind)] for kind in ("search", "baseline")}
     worked = [[name, text] for name, text in wording.method_facts(result).items() if text]
     sections = [
         *_pictures(run, result, animated=bool(frames)),

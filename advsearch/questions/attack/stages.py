@@ -31,7 +31,7 @@ from advsearch.attacks.evaluation import Query
 from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
 from advsearch.engine import planning, surface_light
 from advsearch.engine.bank import Bank
-from advsearch.engine.gradients import inside
+from advsearch.engine.gradients import Bench, inside
 from advsearch.engine.journal import PLAN, Journal, finite, other_numbers, same
 from advsearch.engine.judging import penalised
 from advsearch.engine.problem import Problem
@@ -114,26 +114,27 @@ class Attack:
         self.journal.set_note(PLAN, chosen)
 
     def _measure(self) -> None:
-        problem, config, tick = self.problem, self.config, self.stages.progress.advance
+        problem, config, progress = self.problem, self.config, self.stages.progress
         full = config.measure == "full"
         if config.measure == "no" or not self.policy.uses_gradient:
             return
         if not full and reason_against(problem, problem.steps, config.specialise) is None:
             return  # derivatives will come from what predicts the pictures
         renderer, counted = problem.renderer, not full or config.deterministic
-        u, seed = inside(renderer), seeds.stream(problem.seed, "measure")
+        seed = seeds.stream(problem.seed, "measure")
+        bench = Bench(
+            renderer, problem.loss, inside(renderer), seed, problem.spp, tick=lambda samples: progress.advance(1)
+        )
         gradients = planning.plan_gradients(renderer.plan, every=full)
         if gradients:
             hint = f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; `measure=no` leaves it out"
             self.stages.begin("setup", "measuring which gradients are best here", gradients, hint=hint)
-        problem.plan = planning.measured_plan(
-            renderer, problem.loss, u, seed=seed, spp=problem.spp, every=full, counted=counted, tick=tick
-        )
+        problem.plan = planning.measured_plan(bench, every=full, counted=counted)
         if full:
             samples = planning.cosine_samples(problem.plan)
             hint = "counted in samples a pixel; `measure=quick` leaves it out"
             self.stages.begin("setup", "choosing step and samples of gradients", samples, hint=hint, at_most=True)
-            table = list(planning.cosines(renderer, problem.loss, u, seed=seed, tick=tick))
+            table = list(planning.cosines(replace(bench, tick=progress.advance)))
             problem.plan, spp = planning.tuned(problem.plan, table)
             problem.spp = spp if config.spp is None and spp is not None else problem.spp
 

@@ -8,6 +8,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,7 +18,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.controls import CONTROLS
 from advsearch.engine import planning
-from advsearch.engine.gradients import FACTORS, Loss, attempts, derivatives, inside, smooth_loss
+from advsearch.engine.gradients import FACTORS, Bench, Loss, attempts, inside, smooth_loss
 from advsearch.engine.naming import settings_alone
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Results, taken_rows
@@ -126,53 +127,50 @@ def _linear(part: CheckedPart, title: str, results: Results, progress: Progress)
     problem.renderer.formation = replace(problem.renderer.formation, transfer="linear")
     problem.renderer.plan = problem.renderer.plan.at_a_pixel()
     loss = smooth_loss(problem.renderer.formation.resolution, config.seed)
-    spp = config.spp if isinstance(config.spp, int) else RAW_SPP
-    how = {"reference_spp": REFERENCE_SPP, "seeds_of_reference": SEEDS, "reference_factors": FACTORS[:2]}
-    for row in _derivatives(problem, part, title, results, progress, loss=loss, spp=spp, tried=attempts, **how):
+    bench = _bench(part, problem.renderer, loss, results, progress)
+    bench = replace(bench, spp=config.spp if isinstance(config.spp, int) else RAW_SPP)
+    for row in bench.derivatives(
+        reference_spp=REFERENCE_SPP, seeds_of_reference=SEEDS, reference_factors=FACTORS[:2], tried=attempts,
+        stage=partial(_stage, title, progress),
+    ):  # fmt: skip
         yield part.row(row)
 
 
 def _model(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[Finding]:
     config = part.config
     problem, _ = problem_from_config(config)
-    renderer, u = problem.renderer, inside(problem.renderer)
+    renderer = problem.renderer
     counts = tuple(count for count in (*planning.COUNTS, MOST) if count >= problem.spp) or (problem.spp,)
-
-    def keep(name: str, measure: Any) -> Any:
-        return results.get(f"{part.key} {name}", measure)
-
+    bench = replace(_bench(part, renderer, problem.loss, results, progress), spp=problem.spp)
     progress.stage(f"{title}: comparing ways to differentiate", planning.plan_gradients(renderer.plan), hint=HINT)
-    seed = seeds.stream(config.seed, "measure")
-    renderer.plan = planning.measured_plan(
-        renderer, problem.loss, u, seed=seed, spp=problem.spp, counted=True, tick=progress.advance, keep=keep
-    )
+    renderer.plan = planning.measured_plan(replace(bench, seed=seeds.stream(config.seed, "measure")), counted=True)
     steps = {group.name: group.step for group in renderer.plan.groups}
     most = planning.cosine_samples(renderer.plan, counts=counts)
     progress.stage(f"{title}: the model's gradients", most, hint=f"counted in samples a pixel; {HINT}", at_most=True)
-    table, tick = list[Measured](), progress.advance
-    for row in planning.cosines(renderer, problem.loss, u, seed=config.seed, counts=counts, tick=tick, keep=keep):
+    table = list[Measured]()
+    for row in planning.cosines(replace(bench, seed=config.seed, tick=progress.advance), counts=counts):
         table.append(row)
         yield part.row(row)
     renderer.plan, spp = planning.tuned(renderer.plan, table)
     if not config.all:
         yield from _planned(problem, part, spp or problem.spp, results, progress)
     wider = {group.name: group.step / steps[group.name] for group in renderer.plan.groups if steps[group.name]}
-    how = {"loss": problem.loss, "spp": spp or problem.spp}
-    how |= {"reference_spp": planning.CONVERGED, "seeds_of_reference": FEW_SEEDS}
-    for row in _derivatives(problem, part, title, results, progress, **how):
+    for row in replace(bench, spp=spp or problem.spp).derivatives(
+        reference_spp=planning.CONVERGED, seeds_of_reference=FEW_SEEDS, stage=partial(_stage, title, progress)
+    ):
         group = f"{row.control}.{row.parameter.partition('.')[0]}"  # coordinates of one have a number behind it
         yield part.row(row, factor=wider.get(group, 1.0))
 
 
-def _derivatives(
-    problem: Problem, part: CheckedPart, title: str, results: Results, progress: Progress, *, loss: Any, **how: Any
-) -> Iterator[Measured]:
-    return derivatives(
-        problem.renderer, loss, inside(problem.renderer), seed=seeds.stream(part.config.seed, "check"),
-        value=lambda name, kind, measure: results.value(f"{part.key} {name}", kind, measure),
-        stage=lambda name, most: progress.stage(f"{title}: {name}", most, hint=HINT, at_most=True),
-        tick=progress.advance, **how,
+def _bench(part: CheckedPart, renderer: Renderer, loss: Loss, results: Results, progress: Progress) -> Bench:
+    return Bench(
+        renderer, loss, inside(renderer), seeds.stream(part.config.seed, "check"), RAW_SPP,
+        keep=lambda name, measure: results.get(f"{part.key} {name}", measure), tick=lambda samples: progress.advance(1),
     )  # fmt: skip
+
+
+def _stage(title: str, progress: Progress, name: str, most: int) -> None:
+    progress.stage(f"{title}: {name}", most, hint=HINT, at_most=True)
 
 
 def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, progress: Progress) -> Iterator[Finding]:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.engine.gradients import Estimate, Loss, Probe, agreement, estimated, only, probes, reference
+from advsearch.engine.gradients import Bench, Estimate, Loss, Probe, agreement, only
 from advsearch.questions.precision.result import PrecisionReference
 from advsearch.questions.precision.rule import Array, Numbers, ReferenceValue, SampleSetting, reference_of
 from advsearch.scene.gradients import BY_ADJOINT, Group, compared
@@ -278,7 +278,7 @@ class GradientBench:
 
             def both(noise: int, spp: int) -> Array:
                 """Of each coordinate the derivative, extrapolated to a step of zero, and how far two steps differ."""
-                of = partial(reference, self._exact, self._loss, self._u, seed=noise, spp=spp, repeats=(1, 1))
+                of = partial(Bench(self._exact, self._loss, self._u, noise, spp).reference, repeats=(1, 1))
                 rows = [(found.value, found.steps[0] - found.steps[1]) for found in map(of, along)]
                 table: Array = np.array(rows, dtype=np.float64).T
                 return table
@@ -308,8 +308,9 @@ class GradientBench:
             return None
         exact = self._exact
         exact.plan = only(exact.plan, {group.name for group in self.part.groups}, self._by)
-        probe = probes(exact, self._loss, self._u, seed, 64)[0]
-        against = reference(exact, self._loss, self._u, probe, seed=seed, spp=64, repeats=(2, 4))
+        bench = Bench(exact, self._loss, self._u, seed, spp=64)
+        probe = bench.probes()[0]
+        against = bench.reference(probe, repeats=(2, 4))
         own = float(self.reference.value @ self.part.of(probe.direction))
         estimate = Estimate(self._by, own, self.reference.error * abs(own), 1, 0.0)
         if agreement(estimate, against).status != "biased":
@@ -320,8 +321,8 @@ class GradientBench:
         )
 
     def _taken(self, renderer: Renderer, estimator: str, seed: int, spp: int) -> Array:
-        names = {group.name for group in self.part.groups}
-        return self.part.of(estimated(renderer, self._loss, self._u, estimator, names, seed, spp))
+        plan = only(renderer.plan, {group.name for group in self.part.groups}, estimator)
+        return self.part.of(Bench(renderer, self._loss, self._u, seed, spp).gradient(plan, seed))
 
 
 def _row(quantity: str, name: str, value: ReferenceValue, spp: int, control: str = "") -> PrecisionReference:

@@ -19,7 +19,7 @@ from advsearch.controls.sensor import SensorControl, through_sensor
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import control_group, verified_rate
-from advsearch.engine.verifier import RetrialCondition, Retrials, kept_configuration, unchanged
+from advsearch.engine.verifier import RetrialCondition, Retrials, kept_configuration
 from advsearch.errors import InputError
 from advsearch.progress import Progress, Watched, watcher
 from advsearch.question import Asked, carried_out
@@ -82,8 +82,8 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
     renderer = problem.renderer
     scene, formation = renderer.scene, renderer.formation
 
-    def same(count: int = spp, change: Callable[[Tensor, int], Tensor] = unchanged) -> Callable[..., RetrialCondition]:
-        return lambda name: RetrialCondition(name, problem, count, OWN_LIGHT, change, OWN_LIGHT)
+    def same(count: int = spp, **changed: Any) -> Callable[..., RetrialCondition]:
+        return lambda name: RetrialCondition(name, problem, count, OWN_LIGHT, light=OWN_LIGHT, **changed)
 
     def other(**made: Any) -> Callable[..., RetrialCondition]:
         sampler = {"sampler": made["sampler"]} if "sampler" in made else {}

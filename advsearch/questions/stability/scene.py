@@ -16,7 +16,7 @@ from torch import Tensor
 from advsearch.attacks import PGD, Domain, Evaluation, Policy, Query, SearchResult, search
 from advsearch.controls import Space, make_control, make_space
 from advsearch.engine import judging
-from advsearch.engine.gradients import Loss, derivatives, smooth_loss
+from advsearch.engine.gradients import Bench, Loss, smooth_loss
 from advsearch.questions.stability.result import Outcome, check, holds
 from advsearch.runs.results import Measured
 from advsearch.scene import library
@@ -176,8 +176,8 @@ def compared(
     before, many = renderer.formation, (repeats, repeats)
     renderer.formation = replace(before, transfer="linear")
     try:
-        rows = partial(derivatives, renderer, smooth_loss(before.resolution), u, seed=1, spp=spp, repeats=many)
-        return list(rows(reference_spp=REFERENCE_SPP, seeds_of_reference=seeds))
+        bench = Bench(renderer, smooth_loss(before.resolution), u, seed=1, spp=spp)
+        return list(bench.derivatives(reference_spp=REFERENCE_SPP, seeds_of_reference=seeds, repeats=many))
     finally:
         renderer.formation = before
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -73,7 +73,7 @@ class Sweep:
         self.units = replace(self.points.units, models=self.models)
         if run is not None:
             run.store.set_note(EDGES, json.dumps({drawn.name: drawn.edges for drawn in self._shown if drawn.edges}))
-            run.store.set_note(NOTE, json.dumps(self.units.noted))
+            run.store.set_note(NOTE, json.dumps(asdict(self.units)))
         self.total = len(job.places) * self.per_scene * self.models
         self._scenes = OpenScenes(job)
         self._executor = InProcess(worker_call(self._scenes.named)) if executor is None else executor
@@ -340,7 +340,7 @@ class Sweep:
             surface=self._surface,
             drives=self._drives,
             changes=changes,
-            shared=SharedWork.of_facts(self._executor.facts, self.journal.machines.known),
+            shared=SharedWork.of_facts(self._executor.facts, self.journal.machines),
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.config.seed,
@@ -369,7 +369,7 @@ class Sweep:
     def _remarks(
         self, predictions: Predictions, checked: WorstVerified | None, changes: Sequence[results.ChangeRates]
     ) -> list[str]:
-        remarks = [*lost_remarks(self._lost), *self.journal.machines.remarks]
+        remarks = [*lost_remarks(self._lost), *self.journal.remarks]
         few = min((rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES)
         if few < ENOUGH_DRIVES:
             remarks.append(

@@ -170,7 +170,7 @@ class Trial:
                 picture = pictures.get(query.number)  # what was asked before is read back, without its picture
                 if picture is None:
                     picture = problem.picture(query.u, query.seed, query.spp)
-                yield other.trial(shown(query, picture), other.whole(query.u))
+                yield Evaluation.of(other.judge(shown(query, picture), other.whole(query.u)))
 
         at_once = 1 if journal.traced.executor is None else AHEAD * (self.config.workers or 8)
         while batch := list(islice(queries, at_once)):

@@ -36,7 +36,7 @@ from advsearch.attacks import (
     seeded,
 )
 from advsearch.attacks.policies import choices
-from advsearch.attacks.policies.choices import MOST, Stay, with_choices
+from advsearch.attacks.policies.choices import MOST, with_choices
 from advsearch.errors import InputError, UnknownNameError
 
 BOX = Domain(torch.tensor([0.3, 0.6]), (Block(2),))
@@ -287,7 +287,7 @@ def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:
 
 def test_who_handles_choices_is_left_alone() -> None:
     choosy = Domain(torch.tensor([0.1, 0.5]), (Block(1, options=3), Block(1)))
-    for policy in (Auto(), Random(), Stay(), Portfolio()):
+    for policy in (Auto(), Random(), Portfolio()):
         assert with_choices(policy, choosy) is policy
     assert with_choices(PGD(), choosy) == Choices(PGD())
     assert with_choices(PGD(), BOX) == PGD()
