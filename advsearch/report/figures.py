@@ -112,8 +112,6 @@ def search_axes(
     axes.legend()
 
 
-# ---- parts ----------------------------------------------------------------------------------------------------------
-
 MARGIN, ACCURACY = "margin [logits]; below 0: wrong", "accuracy"
 """What the colours of a map may mean: red is wrong in both."""
 MOST_POINTS = 400  # Values of an axis that are drawn
@@ -169,7 +167,15 @@ def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
     image = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST)
     for shape in sorted(shapes, key=lambda shape: shape.true):
         if shape.mask is not None:
-            _draw_mask(image, np.asarray(shape.mask, dtype=bool), shape.true)
+            mask = Image.fromarray(np.asarray(shape.mask, dtype=bool))
+            whole = np.asarray(mask.resize(size, Image.Resampling.NEAREST))
+            strength = whole * TINT
+            if shape.true:  # the outline alone, two pixels wide
+                far = np.pad(whole, 2)
+                inner = whole & far[4:, 2:-2] & far[:-4, 2:-2] & far[2:-2, 4:] & far[2:-2, :-4]
+                strength = (whole & ~inner).astype(float)
+            colour = Image.new("RGB", size, TRUE if shape.true else SAID)
+            image.paste(colour, (0, 0), Image.fromarray(np.rint(255.0 * strength).astype(np.uint8)))
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(max(size) // LETTERS)
     boxes = [(shape, _corners(shape.box, factor, size)) for shape in shapes if shape.box is not None]
     for shape, ends in boxes:
@@ -178,30 +184,15 @@ def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
     for shape, ends in boxes:
         written.append(_write(draw, shape, ends, size, font, written))
     maps = sorted((shape for shape in shapes if shape.map is not None), key=lambda shape: not shape.true)
-    panels = [image, *(_panel(shape, maps[0].map, size, font) for shape in maps)]
+    panels = [image]
+    for shape in maps:
+        low, high = float(maps[0].map.min()), float(maps[0].map.max())
+        greys = np.clip((np.asarray(shape.map, dtype=np.float64) - low) / max(high - low, 1e-12), 0.0, 1.0)
+        levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
+        panels.append(Image.fromarray(levels).resize(size, Image.Resampling.NEAREST).convert("RGB"))
+        _write(ImageDraw.Draw(panels[-1]), shape, (0, 0, size[0] - 1, size[1] - 1), size, font, [])
     sheet: Floats = np.hstack([np.asarray(panel, dtype=np.float32) for panel in panels]) / np.float32(255.0)
     return sheet
-
-
-def _panel(shape: Shape, first: Any, size: tuple[int, int], font: Any) -> Image.Image:
-    low, high = float(first.min()), float(first.max())
-    greys = np.clip((np.asarray(shape.map, dtype=np.float64) - low) / max(high - low, 1e-12), 0.0, 1.0)
-    levels = np.rint(255.0 * np.nan_to_num(greys)).astype(np.uint8)
-    panel = Image.fromarray(levels).resize(size, Image.Resampling.NEAREST).convert("RGB")
-    _write(ImageDraw.Draw(panel), shape, (0, 0, size[0] - 1, size[1] - 1), size, font, [])
-    return panel
-
-
-def _draw_mask(image: Image.Image, mask: npt.NDArray[np.bool_], true: bool) -> None:
-    whole = np.asarray(Image.fromarray(mask).resize(image.size, Image.Resampling.NEAREST))
-    colour, strength = Image.new("RGB", image.size, TRUE if true else SAID), whole * TINT
-    if true:
-        inner = np.pad(whole, 2)[2:-2, 2:-2]
-        for axis in (0, 1):
-            for step in (-2, 2):
-                inner = inner & np.roll(np.pad(whole, 2), step, axis=axis)[2:-2, 2:-2]
-        strength = (whole & ~inner).astype(float)
-    image.paste(colour, (0, 0), Image.fromarray(np.rint(255.0 * strength).astype(np.uint8)))
 
 
 def _corners(box: Box, factor: int, size: tuple[int, int]) -> tuple[int, int, int, int]:

@@ -176,9 +176,6 @@ def _parts(piece: Piece, width: float, height: float) -> Iterator[Placed]:
             yield Placed(piece, name, (left + x0, left + x1, top + y0, top + y1))
 
 
-# ---- drawing --------------------------------------------------------------------------------------------------------
-
-
 def blank(paper: tuple[float, float]) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(paper[0] / INCH, paper[1] / INCH))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))

@@ -155,9 +155,6 @@ def facts_of(result: Result, given: ShownResult) -> dict[str, str]:
     return {name: text for name, text in {**given.facts, **own, **given.facts}.items() if text}
 
 
-# ---- fields as they are ---------------------------------------------------------------------------------------------
-
-
 def fields_shown(result: Result) -> ShownResult:
     """Return the lists of a result as tables, its other fields as facts, and what their names mean."""
     values = {name: getattr(result, name) for name in type(result).described()}
@@ -375,19 +372,19 @@ class InNotebook:
 def result_html(given: ShownResult, pictures: Mapping[str, ArrayLike] | None = None) -> str:
     figures = []
     for name, image in (pictures or {}).items():
-        inside = _picture(png_bytes(image), SHOWN, name), element("figcaption", name)
-        figures.append(element("figure", *inside, style="display:inline-block"))
+        picture = _picture(png_bytes(image), SHOWN, name)
+        figures.append(element("figure", picture, element("figcaption", name), style="display:inline-block"))
     figure = result_figure(given)
     chart = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
     parts = []
     for part in given.sections:
         if part.only in ("", "notebook") and not part.empty:
-            heads = (
-                element("thead", element("tr", *(element("th", cell) for cell in part.heads))) if part.heads else None
-            )
-            rows = (element("tr", *(element("td", cell) for cell in row)) for row in part.rows)
             inside = [element("p", text) for text in part.text if text and part.draw is None]
-            inside += [element("table", heads, element("tbody", *rows))] if part.rows else []
+            if part.rows:
+                heads = element("tr", *(element("th", cell) for cell in part.heads))
+                rows = (element("tr", *(element("td", cell) for cell in row)) for row in part.rows)
+                head = element("thead", heads) if part.heads else None
+                inside.append(element("table", head, element("tbody", *rows)))
             title = element("p", element("b", part.title)) if part.title else None
             folded = element("details", element("summary", part.title), *inside)
             parts.append(folded if part.folded else element("div", title, *inside))

@@ -141,9 +141,6 @@ def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:
     return policy
 
 
-# ---- what is asked for ----------------------------------------------------------------------------------------------
-
-
 @dataclass
 class AttackParts:
     """Everything that was asked for, found and loaded: the model and what was said of it, a task that is not yet on the
@@ -380,13 +377,8 @@ def attack(
     options = {name: value for name, value in settings.items() if value is not None}
     task = make_task(task) if callable(task) else task
     loaded_already = not all(isinstance(network, (str, Path)) for network in (scene, *several(model)))
-    if (
-        loaded_already
-        or callable(objective)
-        or loading.only_here(controls)
-        or loading.only_here(over)
-        or isinstance(task, OwnTask)
-    ):
+    own_controls = [*loading.only_here(controls), *loading.only_here(over)]
+    if loaded_already or callable(objective) or own_controls or isinstance(task, OwnTask):
         naming.check_not_spread(options)
 
     def policy_of(setting: Any) -> Policy[Any]:
@@ -400,8 +392,8 @@ def attack(
     if isinstance(scene, Scene):
         naming.check_not_of_scene({**settings, "object": object})
     else:
-        named = {name: settings[name] for name in naming.OF_SCENE if name in settings}
-        place = SceneConfig(**{"object": "mug", **named})
+        of_scene = {name: settings[name] for name in naming.OF_SCENE if name in settings}
+        place = SceneConfig(**{"object": "mug", **of_scene})
         light, more = place.environment, naming.told_of_scene(place)
         if object is not None:
             scene = loading.load_scene(object, light, scene=scene, **more)
@@ -432,7 +424,7 @@ def attack(
     parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
     parts += [f"the objective {config.objective}"] if callable(objective) else []
     parts += [f"the policy {policy.name}"] if isinstance(policy, Policy) and not is_named(policy, policy_of) else []
-    parts += [f"the control {name}" for name in (*loading.only_here(controls), *loading.only_here(over))]
+    parts += [f"the control {name}" for name in own_controls]
     parts += [f"the metric {name}" for name in judging.only_here(config.metrics)]
     if config.workers is not None or config.cluster is not None:
         judging.check_shared(config.metrics)

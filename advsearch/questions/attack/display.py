@@ -58,9 +58,6 @@ def claims(result: AttackResults) -> Iterator[Claim]:
             yield saying.average_claim(result.average, wording.budget_text(result))
 
 
-# ---- one attack -----------------------------------------------------------------------------------------------------
-
-
 def _shown_attack(summary: AttackSummary) -> ShownResult:
     sections = [_rates(summary)]
     if summary.failures and summary.failures.tried:

@@ -330,9 +330,6 @@ def _remarks(findings: Findings, problem: Problem, journal: Journal) -> list[str
     return [*remarks, *lost_remarks(journal.lost), *journal.remarks]
 
 
-# ---- different failures ---------------------------------------------------------------------------------------------
-
-
 def described_failures(problem: Problem, findings: Findings) -> DifferentFailures | None:
     known = findings.search.failures if findings.search else None
     if known is None:

@@ -95,8 +95,6 @@ class Attack:
         self.stages.end()
         return self.findings
 
-    # ---- before the search ------------------------------------------------------------------------------------------
-
     def plan(self) -> None:
         problem, config, stored = self.problem, self.config, self.journal.note(PLAN)
         if stored is not None:
@@ -176,8 +174,6 @@ class Attack:
         self._verifier.try_clean()
         return not problem.rule.already_wrong(count_right(findings.clean, findings.spp))
 
-    # ---- verification -----------------------------------------------------------------------------------------------
-
     def verify(self) -> None:
         """Choose the sample count, then try the clean configuration, the adversarial configuration, that without print
         terms and the baseline's with equal seeds.
@@ -230,8 +226,6 @@ class Attack:
             names = ("best_u", "best_objective", "claimed_objective", "success_rate")
             taken = {name: getattr(baseline, name) for name in names}
             findings.search = replace(result, **taken, distribution=None)
-
-    # ---- searches ---------------------------------------------------------------------------------------------------
 
     def collect_transport(self) -> None:
         problem, steps, findings = self.problem, self.problem.steps, self.findings

@@ -75,11 +75,6 @@ class StudyAttack:
     of: str
     epsilon: float | None = None
 
-    @property
-    def title(self) -> str:
-        """What it is, in words."""
-        return self.config.object + ("" if self.of == self.config.object else f" with {self.of}")
-
 
 Chain = list[StudyAttack]  # Attacks that follow one another, until one finds something
 
@@ -101,17 +96,14 @@ def chains_of(config: AttackConfig) -> list[Chain]:
             alone = AttackConfig.of(config, **({} if config.ensemble else {"model": name}))
             chains.append([StudyAttack(alone, f"{place:02d}-" + default_name(name, []), name)])
     else:
+        epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]  # None is the own of each control
         for place, name in enumerate(different(config.objects, "object")):
             chains.append([])
-            for epsilon in _epsilons(config):
+            for epsilon in epsilons:
                 words = [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
                 changed = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
                 chains[-1].append(StudyAttack(changed, f"{place:02d}-" + default_name(name, words), name, epsilon))
     return chains
-
-
-def _epsilons(config: AttackConfig) -> list[float | None]:
-    return [*sorted(config.epsilons)] or [None]
 
 
 def attacks_of(settings: JsonObject) -> Call:
@@ -151,7 +143,8 @@ def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Pr
         progress.stage("attacks on workers", len(left))
         for done in executor.results([number] for number in left):
             if done.lost:
-                title = chains[done.items[0]][0].title
+                (lost, *_) = chains[done.items[0]]
+                title = lost.config.object + ("" if lost.of == lost.config.object else f" with {lost.of}")
                 raise ClusterError(f"{title}: {done.lost}; leave it out, or go on without it")
             for name, before, files_there in done.value:
                 path, part = run / PARTS / name, run / PARTS / f"{PART}{name}"
@@ -164,9 +157,6 @@ def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Pr
                     part.rename(path)
             facts = executor.facts
             progress.advance(1, **({} if facts is None else {"workers": facts.workers}))
-
-
-# ---- one study ------------------------------------------------------------------------------------------------------
 
 
 class StudyRun:
@@ -203,9 +193,8 @@ class StudyRun:
         budget = f", epsilon {config.epsilon:.3g}" if isinstance(config.epsilon, float) else ""
         what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
         self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
-        summary = carry_out_part(
-            path, config, self.progress, lambda there, **more: attacking.attack_once(there, clean=clean, **more).summary
-        )
+        ask = lambda there, **more: attacking.attack_once(there, clean=clean, **more).summary  # noqa: E731
+        summary = carry_out_part(path, config, self.progress, ask)
         if not isinstance(summary, AttackSummary):
             raise FileFormatError(f"{path}: expected the run of an attack, got one of {summary.command}")
         self.warnings += [text for text in summary.warnings if text not in self.warnings]
@@ -215,9 +204,6 @@ class StudyRun:
 
     def result(self, kind: type[Made], **fields: Any) -> Made:
         return self.asked.result(kind, parts=self.names, warnings=self.warnings, **fields)
-
-
-# ---- several objects or epsilons, and several models ----------------------------------------------------------------
 
 
 def curve(asked: Asked[AttackConfig]) -> CurveResult:
@@ -245,7 +231,7 @@ def curve(asked: Asked[AttackConfig]) -> CurveResult:
             if row.ending in SETTLED:
                 break
         rows.append(row)
-    epsilons = _epsilons(asked.config)
+    epsilons: list[float | None] = [*sorted(asked.config.epsilons)] or [None]
     points = [_accuracy(rows, epsilon) for epsilon in epsilons]
     return study.result(CurveResult, epsilons=epsilons, table=rows, curve=points)
 

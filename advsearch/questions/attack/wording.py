@@ -223,9 +223,6 @@ def _clauses(summary: AttackSummary, thing: str) -> tuple[str, str]:
     return claim, words.wanted(summary.objective, thing)
 
 
-# ---- how it came to its result ---------------------------------------------------------------------------------------
-
-
 def method_facts(summary: AttackSummary) -> dict[str, str]:
     facts = dict[str, str]()
     claimed, chosen, seen = summary.claimed, summary.sample_count, summary.gradients

@@ -48,14 +48,29 @@ FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
 def checked(asked: Asked[CheckConfig]) -> CheckResult:
     """Do what is asked, or go on with it. What is measured is stored at once, so that a check that was stopped goes on
     where it was and ends with the same rows; only times differ."""
-    asked.progress.stage(LOADING)
+    progress = asked.progress
+    progress.stage(LOADING)
     parts, measured = parts_of(asked.config), 0
     results, configs = Results(asked.run, asked.config.seconds), [part.config for part in parts]
 
     def findings() -> Iterator[Finding]:
         nonlocal measured
         for part in parts:
-            yield from _findings_of(part, len(parts), results, asked.progress)
+            if (stored := results.stored(part.key)) is not None:  # measured before: nothing is loaded
+                yield from FINDINGS.validate_python(stored)
+            else:
+                title = f"{part.config.object} in {part.config.lit_by}, {' and '.join(part.config.controls)}"
+                title += f" ({part.number} of {len(parts)})" if len(parts) > 1 else ""
+                progress.stage(f"loading {title}")
+                taken, find = [], _linear if part.loss == "linear" else _model
+                for finding in find(part, title, results, progress):
+                    taken.append(finding.to_dict())
+                    yield finding
+                    if isinstance(finding, CheckedRow):  # whoever reads it can stop the check and find the row kept
+                        how = f"{finding.value:.3g}" if finding.cosine is None else f"cosine {finding.cosine:.2f}"
+                        what = f"{finding.object}, {finding.name} by {finding.estimator}"
+                        progress.message(f"{what}: {how}, {finding.status}")
+                results.put(part.key, taken)
             measured += 1
 
     def result(taken: list[Finding]) -> CheckResult:
@@ -104,25 +119,6 @@ def parts_of(config: CheckConfig) -> list[CheckedPart]:
                 configs.append(config.model_copy(update={**place, **alone}))
     asked = [(each, loss) for each in configs or [config] for loss in config.losses]
     return [CheckedPart(number, each, loss) for number, (each, loss) in enumerate(asked, start=1)]
-
-
-def _findings_of(part: CheckedPart, parts: int, results: Results, progress: Progress) -> Iterator[Finding]:
-    stored = results.stored(part.key)
-    if stored is not None:
-        yield from FINDINGS.validate_python(stored)
-        return
-    config = part.config
-    title = f"{config.object} in {config.lit_by}, {' and '.join(config.controls)}"
-    title += f" ({part.number} of {parts})" if parts > 1 else ""
-    progress.stage(f"loading {title}")
-    taken = []
-    for finding in (_linear if part.loss == "linear" else _model)(part, title, results, progress):
-        taken.append(finding.to_dict())
-        yield finding
-        if isinstance(finding, CheckedRow):  # whoever reads it can stop the check and find the row kept
-            how = f"{finding.value:.3g}" if finding.cosine is None else f"cosine {finding.cosine:.2f}"
-            progress.message(f"{finding.object}, {finding.name} by {finding.estimator}: {how}, {finding.status}")
-    results.put(part.key, taken)
 
 
 def _linear(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[CheckedRow]:
@@ -194,9 +190,7 @@ def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, pr
     if not config.specialise:
         return
     seed, hint = seeds.stream(config.seed, "leaving out"), "`specialise=false` leaves it out"
-
-    def tick() -> None:
-        progress.advance(1)
+    tick = progress.advance
 
     def lengths() -> PathLength:
         most = planning.most_pictures(problem)
@@ -205,15 +199,11 @@ def _planned(problem: Problem, part: CheckedPart, spp: int, results: Results, pr
 
     def gains() -> list[GainRow]:
         progress.stage("measuring what leaving things out saves", MOST_GRADIENTS, hint=hint, at_most=True)
-        depth = length.depth
-        return measured_gains(renderer, problem.loss, u, seed=seed, spp=problem.spp, depth=depth, tick=tick)
+        return measured_gains(renderer, problem.loss, u, seed=seed, spp=problem.spp, depth=length.depth, tick=tick)
 
     yield (length := results.row(f"{part.key} bounces", PathLength, lengths))
     yield from results.rows(f"{part.key} gains", GainRow, gains)
     yield from results.rows(f"{part.key} texels", TexelRow, lambda: resolved_texels(renderer, u, seed=seed))
-
-
-# ---- what leaving something out saves --------------------------------------------------------------------------------
 
 
 ALL, BOUNCES = "everything above", "bounces"

@@ -210,8 +210,6 @@ def denoiser_of(line: str) -> str:
     return "oidn" if line.endswith(OIDN) else "none"
 
 
-# ---- gradients ------------------------------------------------------------------------------------------------------
-
 ADJOINT_COST = {"adjoint": 3.0, "material": 60.0}
 """An adjoint takes about as long as so many renders, the kernels that the material form compiles included."""
 BY_COORDINATE = 32  # sets of at most so many coordinates have a reference by differences, coordinate by coordinate

@@ -285,9 +285,6 @@ def _between(interval: Interval | None) -> str:
     return "" if interval is None else f"{100 * interval[0]:.2g} to {100 * interval[1]:.2g}"
 
 
-# ---- figures ---------------------------------------------------------------------------------------------------------
-
-
 COLORS = (BLUE, "#b4540a", "#1f7a45", "#7a3fa8", RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f", "#3f5fd0", "#a06a50")
 MARKERS = "osD^vP*X<>d"
 PANEL = (5.6, 3.9)  # width and height of one diagram in inches

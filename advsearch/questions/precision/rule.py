@@ -143,9 +143,6 @@ def _ratio(error: float, size: float) -> float:
     return error / size if size > 0.0 else (0.0 if error == 0.0 else math.inf)
 
 
-# ---- how the error falls --------------------------------------------------------------------------------------------
-
-
 def fit_line(points: Sequence[PrecisionPoint], or_steeper: bool | None = None) -> PrecisionSlope | None:
     """Return the least-squares line of log error against log samples.
 
@@ -190,9 +187,6 @@ def levels_off(points: Sequence[PrecisionPoint]) -> bool:
     known = sorted((point for point in points if point.known), key=lambda point: point.spp)
     steps = [math.log(b.rms / a.rms) / math.log(b.spp / a.spp) for a, b in pairwise(known) if b.spp > a.spp]
     return len(steps) >= 2 and steps[-1] > 0.5 * min(*steps[:-1], 0.0)
-
-
-# ---- what is recommended --------------------------------------------------------------------------------------------
 
 
 def exactly(point: PrecisionPoint, samples: float) -> int:

@@ -71,7 +71,6 @@ class Evidence(Result):
 CROSSWALK_HEADS = ("in the evidence", "ISO 21448", "ISO/PAS 8800", "AI Act, article 15")
 # Compared in November 2026 with what is public: article 15 whole; the contents of ISO 21448 (clauses 4 to 8) and of
 # ISO/PAS 8800 (5 to 7), and for its clause 11 a published overview. The other clauses are from memory.
-# fmt: off
 CROSSWALK = (
     ("What varied, operational design domain", "5 Specification and design", "9 AI safety requirements; 11 data",
      "15(4) environment of use"),
@@ -85,8 +84,7 @@ CROSSWALK = (
     ("Suites in a pipeline (test)", "13 operation phase", "14 measures in operation", "15(1) through the lifecycle"),
     ("Excluded, not shown, photographs", "12 achievement", "8 assurance argument", "15(3) instructions of use"),
     ("Versions, hashes, commands", "9 strategy", "15 confidence in tools", ""),
-)
-# fmt: on
+)  # fmt: skip
 NO_CONFORMITY = (
     "The table says under which clause a figure may be read: ISO 21448:2022, ISO/PAS 8800:2024, Regulation (EU) "
     "2024/1689. Of the two standards only clauses 4 to 8 of ISO 21448, and 11 of ISO/PAS 8800, were compared with "

@@ -144,9 +144,6 @@ def shown(result: StabilityResult) -> ShownResult:
     )
 
 
-# ---- cases -----------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Outcome:
     """What a case found: the numbers that decide, and whether every picture and gradient was finite, and none had to be
@@ -185,26 +182,24 @@ class Case:
             what = f"raised {type(error).__name__}: {error}"
             outcome = Outcome([check(what, 1.0, 0.0, 0.0)], finite=False, ending="raised")
         failed = [number for number in outcome.checks if not number.ok]
-        if failed or outcome.finite:
-            decides = "".join(str(number) for number in (failed[:1] or outcome.checks[-1:]))
-        else:
-            decides = "NaN or infinite values"
-        status = OK if outcome.finite and not failed else FELL_SHORT
-        seconds = time.perf_counter() - begun
-        more = {"case": self.name, "status": status, "decides": decides, "seconds": seconds}
+        decides = "".join(map(str, failed[:1] or outcome.checks[-1:]))
+        more = {
+            "case": self.name,
+            "status": OK if outcome.finite and not failed else FELL_SHORT,
+            "decides": decides if failed or outcome.finite else "NaN or infinite values",
+            "seconds": time.perf_counter() - begun,
+        }
         return CaseRow.of({**vars(self), **vars(outcome), **more})
 
 
 CASES: list[Case] = []  # every case, in the order in which they run
 
 
-def case(
-    group: str, name: str, holds: str = "", *, slow: bool = False
-) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
-    """Make a function a case; the first sentence of its docstring says what must hold where `holds` does not."""
+def case(group: str, name: str, *, slow: bool = False) -> Callable[[Callable[[], Outcome]], Callable[[], Outcome]]:
+    """Make a function a case; the first sentence of its docstring says what must hold."""
 
     def added(find: Callable[[], Outcome]) -> Callable[[], Outcome]:
-        sentence = holds or " ".join((find.__doc__ or "").partition("\n\n")[0].split())
+        sentence = " ".join((find.__doc__ or "").partition("\n\n")[0].split())
         CASES.append(Case(name, group, sentence, slow, find))
         return find
 

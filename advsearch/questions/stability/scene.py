@@ -106,8 +106,6 @@ def dark() -> ObjectAsset:
     return painted(np.full((4, 4), 0.02))
 
 
-# ---- what is asked of a scene ---------------------------------------------------------------------------------------
-
 Range = tuple[float | None, float | None]
 
 

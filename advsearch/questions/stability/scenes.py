@@ -80,7 +80,6 @@ LAMP = {"light": {"type": "point", "power": [0.0, 20.0], "x": 1.0, "y": 1.0, "z"
 BRIGHT_TEXEL = {"environment": {"exposure": [-1.0, 1.0]}, "texture": {"resolution": 16}}
 TURNED = {"environment": {"rotation": [0.0, 360.0]}}
 
-# fmt: off
 cases("radiometric", seen, [
     ("hdri-texel-100000", "One texel of 100,000 leaves everything finite, and gradients are right.",
      {"controls": BRIGHT_TEXEL, "environment": FLASH, "slow": True}),
@@ -96,8 +95,7 @@ cases("radiometric", seen, [
     ("camera-exposure-down", RIGHT, exposed("camera", -10.0, -9.0)),
     ("environment-exposure-up", RIGHT, exposed("environment", 9.0, 10.0)),
     ("environment-exposure-down", RIGHT, exposed("environment", -10.0, -9.0)),
-])
-# fmt: on
+])  # fmt: skip
 
 
 def refused_texel(value: float, as_file: bool) -> Outcome:
@@ -149,12 +147,10 @@ def plateau(low: float, high: float) -> Outcome:
 
 
 AWAY = f"From a white picture without a gradient every policy gets away within {PLATEAU_STEPS} evaluations"
-# fmt: off
 cases("radiometric", plateau, [
     ("saturated-plateau", f"{AWAY}.", {"low": -10.0, "high": 10.0}),
     ("saturated-plateau-narrow-way-out", f"{AWAY}; the way out is a tenth of the range.", {"low": 1.0, "high": 10.0}),
-])
-# fmt: on
+])  # fmt: skip
 
 
 # ---- surfaces -------------------------------------------------------------------------------------------------------
@@ -185,7 +181,6 @@ def surface(searched: tuple[str, ...], slow: bool = True, **values: float) -> di
     return {"controls": {"material": {name: [0.0, 1.0] for name in searched}}, "settings": settings, "slow": slow}
 
 
-# fmt: off
 cases("materials", seen, [
     ("roughness-0", "Finite, and the gradient by the roughness is right, at the polished end.",
      surface(("roughness",), slow=False, roughness=0.0)),
@@ -195,8 +190,7 @@ cases("materials", seen, [
      surface(("metallic",), metallic=1.0)),
     ("perfect-mirror", "A metal of roughness 0 is finite, and both gradients are right.",
      surface(("roughness", "metallic"), roughness=0.0, metallic=1.0)),
-])
-# fmt: on
+])  # fmt: skip
 
 
 @case("materials", "clear-glass", slow=True)
@@ -239,7 +233,6 @@ def thrown(u: Sequence[float] | Mapping[int, float] = WHOLE, **projector: float)
     return {"controls": controls, "u": u, "compare": False, "gradient": (1e-12, None)}
 
 
-# fmt: off
 cases("light", seen, [
     ("projector-black", "A black picture changes nothing, and texels have a gradient.",
      {**thrown({}), "beside": {"controls": {"lens": {}}}, "apart": (None, 0.02)}),
@@ -256,8 +249,7 @@ cases("light", seen, [
     ("spot-smallest", "Picture and gradient of a laser's spot are finite.",
      {"controls": {"spot": {"width": [0.02, 0.1], "lumens": [0.0, 10.0]}}, "u": [0.0, 1.0], "compare": False,
       "gradient": (1e-12, None)}),
-])
-# fmt: on
+])  # fmt: skip
 
 
 @case("light", "projector-through-glass")
@@ -311,7 +303,6 @@ def outline(controls: ControlSettings) -> dict[str, object]:
 
 
 AWAY_FROM_IT = {"controls": {"pose": {"z": [-3.0, -2.0]}}, "settings": {"pose.x": 9e3}}
-# fmt: off
 cases("geometry", seen, [
     ("degenerate-triangles", "Faces without area change neither the picture nor the gradient.",
      mesh(DEGENERATE, SQUARE)),
@@ -335,8 +326,7 @@ cases("geometry", seen, [
      {"controls": {"camera": {"distance": [0.5, 0.8], "fov": 10.0}}, "u": [0.5], "compare": False}),
     ("object-leaves-the-frame", "Half outside, the gradient by the shift is right.",
      outline({"pose": {"x": [0.0, 2.0]}})),
-])
-# fmt: on
+])  # fmt: skip
 
 
 @case("geometry", "million-triangles", slow=True)
@@ -424,13 +414,11 @@ def sentences() -> dict[str, str]:
 def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
     """Return the cases of these names and groups; all where neither is given, an UnknownNameError where one is
     unknown."""
-    for kind, asked, known in (
-        ("case", names, [each.name for each in CASES]),
-        ("group", groups, [each.group for each in CASES]),
-    ):
-        for name in asked:
+    for kind, wanted in (("name", names), ("group", groups)):
+        known = dict.fromkeys(getattr(each, kind) for each in CASES)
+        for name in wanted:
             if name not in known:
-                raise UnknownNameError(kind, name, dict.fromkeys(known))
+                raise UnknownNameError("case" if kind == "name" else kind, name, known)
     return [case for case in CASES if not (names or groups) or case.name in names or case.group in groups]
 
 
@@ -516,14 +504,12 @@ def light_rotation_texel() -> Outcome:
 
 
 MIXED = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}, "pose": {"y": [-0.3, 0.3]}}
-# fmt: off
 cases("noise", seen, [
     ("one-sample-a-pixel", "Finite; the mean of 48 gradients is right.",
      {"controls": MIXED, "spp": 1, "repeats": 48, "slow": True}),
     ("one-sample-a-pixel-denoised", "Finite after the denoiser too.",
      {"controls": {"texture": {"resolution": 8}}, "spp": 1, "denoise": "oidn", "compare": False}),
-])
-# fmt: on
+])  # fmt: skip
 
 
 @case("noise", "heavy-tails-of-a-moving-mesh", slow=True)

@@ -42,6 +42,7 @@ MANY = 4  # values of a configuration that are said in words, at most
 MOST_KEPT = 64  # of a configuration with more numbers, a picture's row does not hold the values
 AHEAD = 2  # pictures that are asked for at once, for each worker
 ATTACK_WORKER = "advsearch.questions.attack.carry_out:attack_worker"
+CLAIM_WORKER = "advsearch.questions.test.claims:claim_worker"
 
 
 @dataclass
@@ -91,11 +92,10 @@ class Trial:
         pictures changed."""
         problem, kind, spp = self._problem(config), f"claim {asked.name}", spp_of(config)
         shared = AttackConfig.of(config, workers=self.config.workers, cluster=self.config.cluster)
-        worker, name, other, other_name = ATTACK_WORKER, "", problem, None
+        worker, other, several = ATTACK_WORKER, problem, isinstance(claim, NoWorseClaim)
         shown: Callable[[Query, Tensor], Tensor] | None = None  # to the other side; without, a picture of its own
         if isinstance(claim, NoWorseClaim):
-            other = self._problem(config.model_copy(update={"model": claim.than}))
-            worker, name, other_name = "advsearch.questions.test.claims:claim_worker", "0", "1"
+            worker, other = CLAIM_WORKER, self._problem(config.model_copy(update={"model": claim.than}))
             shared = shared.model_copy(update={"model": f"{config.model},{claim.than}"})
             if other.renderer.formation == problem.renderer.formation:
                 shown = lambda _, picture: picture.clone()  # noqa: E731
@@ -106,12 +106,11 @@ class Trial:
         worst: tuple[float, Query, str] | None = None
         self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
         with executor_for(shared, worker, self.progress) as executor:
-            journal, beside = Journal(self.run, Shared(problem, executor, name)), None
-            if not isinstance(claim, RightClaim):
-                there = Shared(other) if other_name is None else Shared(other, executor, other_name)
-                beside = Journal(self.run, there)
+            journal = Journal(self.run, Shared(problem, executor, "0" if several else ""))
+            beside = Journal(self.run, Shared(other, executor, "1") if several else Shared(other))
             queries = drawn(problem, kind, claim.pictures, spp)
-            for query, own, its in self._pairs(journal, queries, beside, shown):
+            alone = isinstance(claim, RightClaim)
+            for query, own, its in self._pairs(journal, queries, None if alone else beside, shown):
                 value, badness, text = valued(claim, own, its)
                 if value is None:
                     hidden += 1

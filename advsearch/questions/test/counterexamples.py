@@ -231,8 +231,6 @@ def _read(path: Path) -> Counterexample:
     return Counterexample(path.stem, path, config, kept.said, kept.scene, kept.spp, moved)
 
 
-# ---- what is expected -----------------------------------------------------------------------------------------------
-
 EXPECTED = "expected.json"  # what claims said when that was accepted, where they were not held
 
 
