@@ -91,7 +91,7 @@ class AttackResult:
     @property
     def found(self) -> bool:
         """Whether a verified configuration was found."""
-        return self.summary.ending == Ending.FOUND.value
+        return bool(self.summary.ending == Ending.FOUND.value)
 
     @property
     def success(self) -> bool:

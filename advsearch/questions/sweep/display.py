@@ -76,8 +76,8 @@ def shown(summary: SweepSummary) -> ShownResult:
     sections = list[ResultPart]()
     if summary.beside is not None and summary.ending != INTERRUPTED:
         for pair in summary.beside.pairs:
-            named = (("clean", pair.clean), (summary.beside.answer, pair.answer))
-            rows = [[name, f"right in {one.correct} of {one.configurations}", *_share(one)] for name, one in named]
+            sides = (("clean", pair.clean), (summary.beside.answer, pair.answer))
+            rows = [[name, f"right in {side.correct} of {side.configurations}", *_share(side)] for name, side in sides]
             sections.append(ResultPart(rows=rows))
     if far := distance_of(summary):
         sections.append(ResultPart(text=[distance_sentence(far)]))
