@@ -394,7 +394,7 @@ NOT_MESSAGES = (
     "advsearch.settings",
     "advsearch.viewer.document",
     "advsearch.scene.importing.blender",
-    "advsearch.scene.importing.other_formats",
+    "advsearch.scene.importing.files",
 )
 """Modules that read or write flags themselves, also those of another program, and a style sheet."""
 

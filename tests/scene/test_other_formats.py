@@ -11,7 +11,7 @@ import pytest
 from advsearch.errors import FileFormatError
 from advsearch.files import MESHES
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.importing.other_formats import BLENDER_READS, SAID, advice
+from advsearch.scene.importing.files import BLENDER_READS, SAID, advice
 
 ENDINGS = [one for _, endings in BLENDER_READS.values() for one in endings]
 ENDINGS += [one for _, endings in SAID.values() for one in endings]
