@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from advsearch.bundled.objects import HOUSEHOLD, OBJECTS, STREET
-from advsearch.bundled.objects.draw import Draw
+from advsearch.bundled.objects.textures import Draw
 from advsearch.bundled.objects.shapes import carved, grid
 from advsearch.errors import UnknownNameError
 from advsearch.scene import library

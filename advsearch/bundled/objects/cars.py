@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 import advsearch.bundled.objects.shapes as shapes
-from advsearch.bundled.objects.draw import Draw, hexed
+from advsearch.bundled.objects.textures import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family
 from advsearch.bundled.objects.shapes import Array, Patch
 from advsearch.bundled.objects.textures import Paint, Texels, mix, painter, solid, step

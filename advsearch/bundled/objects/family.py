@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.bundled.objects.draw import Draw
+from advsearch.bundled.objects.textures import Draw
 from advsearch.bundled.objects.shapes import Array, Patch
 from advsearch.bundled.objects.textures import Paint, Texels
 from advsearch.scene.assets import Material, Mesh, MeshRig, ObjectAsset, footing

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from advsearch.bundled.objects.draw import Draw, hexed
+from advsearch.bundled.objects.textures import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family
 from advsearch.bundled.objects.shapes import Array, Patch, Rest
 from advsearch.bundled.objects.textures import Texels, mix, noise, painter, step

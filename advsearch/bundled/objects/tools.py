@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import advsearch.bundled.objects.shapes as shapes
-from advsearch.bundled.objects.draw import Draw
+from advsearch.bundled.objects.textures import Draw
 from advsearch.bundled.objects.family import Instance, family, finish
 from advsearch.bundled.objects.shapes import Array, Patch
 from advsearch.bundled.objects.textures import (
