@@ -36,7 +36,7 @@ from advsearch.engine.rendering import looks_at, things_seen
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.runs.results import GroupDerivative, PlannedGradient
-from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.assets import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import NO_MAP
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients import GradientPlan

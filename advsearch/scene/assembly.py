@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.assets import Mesh, Shape
-from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.assets import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import camera_to_world, driving, projected, seated
 from advsearch.scene.gradients import Group

@@ -43,7 +43,7 @@ from advsearch.questions.test.settings import NoWorseClaim, SuiteConfig
 from advsearch.runs.listing import listed_run
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
-from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.assets import linear_to_srgb
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
 from advsearch.viewer.dashboard import following_page
 
