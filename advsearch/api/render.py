@@ -39,7 +39,7 @@ from advsearch.runs.results import RenderResult, Result
 from advsearch.runs.summary import read_configuration, read_result
 from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.hdr import read_exr
-from advsearch.scene.surfaces import aovs_of
+from advsearch.scene.formation import aovs_of
 from advsearch.tasks import AnyTask, make_task
 
 if TYPE_CHECKING:

@@ -38,7 +38,7 @@ from advsearch.runs.export import AFTER, OWN
 from advsearch.runs.results import PrintTerms
 from advsearch.scene.description import OBJECT
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.surfaces import Surfaces
+from advsearch.scene.formation import Surfaces
 from advsearch.scene.things import ALL
 from advsearch.tasks import Facts, Judgement, Task
 from advsearch.tasks.base import Output, Truth, mean

@@ -31,7 +31,7 @@ from advsearch.scene.formation import SAMPLER, ImageFormation, to_8_bit
 from advsearch.scene.outlines import seen_things
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA
-from advsearch.scene.surfaces import Surfaces
+from advsearch.scene.formation import Surfaces
 from advsearch.scene.things import ALL
 from advsearch.settings import as_python
 from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, make_task
@@ -110,7 +110,7 @@ class Rendering:
 
     def save_aov(self, path: str | Path, aovs: Sequence[str]) -> Path:
         """Write ground truth of the view as layers of one EXR, whole or not at all, beside the picture of this path, as
-        ``NAME.aov.exr``, and return its path; `aovs` are names of `advsearch.scene.surfaces.AOVS`. Raises InputError
+        ``NAME.aov.exr``, and return its path; `aovs` are names of `advsearch.scene.formation.AOVS`. Raises InputError
         where `render` was not asked for it, or StorageError."""
         surfaces = self.views[0].surfaces
         if surfaces is None or len(self.views) > 1:

@@ -35,7 +35,7 @@ from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Gro
 from advsearch.scene.mitsuba_backend.variant import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.rig import Mount
-from advsearch.scene.surfaces import Surfaces
+from advsearch.scene.formation import Surfaces
 
 MAX_SPP = 65536
 Configuration = Tensor | npt.NDArray[np.floating[Any]] | Sequence[float]  # a point of the unit box

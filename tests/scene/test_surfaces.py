@@ -13,7 +13,7 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import UnknownNameError
 from advsearch.runs.files import write_layers
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.surfaces import AOVS, CHANNELS, Surfaces, aovs_of
+from advsearch.scene.formation import AOVS, CHANNELS, Surfaces, aovs_of
 
 SIZE = 32
 

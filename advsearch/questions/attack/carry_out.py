@@ -50,7 +50,7 @@ from advsearch.report.wording import count
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
 from advsearch.runs.directory import only_here as only_python_has
 from advsearch.scene.formation import EVERYTHING, NOTHING, next_count
-from advsearch.scene.surfaces import aovs_of
+from advsearch.scene.formation import aovs_of
 from advsearch.scene.things import ALL
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, OwnTask, Task, function_of, make_task

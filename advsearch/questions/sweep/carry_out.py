@@ -38,7 +38,7 @@ from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, fi
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_configuration
 from advsearch.scene.description import ENVIRONMENT
-from advsearch.scene.surfaces import aovs_of
+from advsearch.scene.formation import aovs_of
 from advsearch.scene.things import ALL
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task

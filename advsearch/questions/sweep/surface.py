@@ -37,7 +37,7 @@ from advsearch.scene.description import OBJECT
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.surface_parts import CELLS, SurfaceParts
-from advsearch.scene.surfaces import Surfaces
+from advsearch.scene.formation import Surfaces
 
 Counts = npt.NDArray[np.int64]
 Doubles = npt.NDArray[np.float64]

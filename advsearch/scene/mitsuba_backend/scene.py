@@ -28,7 +28,7 @@ from advsearch.scene.mitsuba_backend.transport import Paths, collect, first_hits
 from advsearch.scene.mitsuba_backend.variant import Plugin, Recordings, dr, mi, one_at_a_time, population
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
 from advsearch.scene.parts import PATTERN, Lamp, LampGlass, plugins_in
-from advsearch.scene.surfaces import Surfaces
+from advsearch.scene.formation import Surfaces
 
 MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
 NO_ROULETTE, ROULETTE = 1000, 2
