@@ -15,7 +15,7 @@ from advsearch.controls.base import NOTHING, Control, Group, Moved, Value
 from advsearch.copies import is_ours
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
-from advsearch.scene.validity import CameraView, past, surroundings_of, view_of
+from advsearch.scene.grounds import CameraView, past, surroundings_of, view_of
 
 VIEWS = 256  # configurations of a camera, a power of two, by which is found how far it goes
 
@@ -165,7 +165,7 @@ class Space:
 
     def notes(self, scene: SceneDescription) -> tuple[str, ...]:
         """Return what a user should know of the scene (without one of its own, of `scene`), and of how far the camera
-        goes in it: see `advsearch.scene.validity`."""
+        goes in it: see `advsearch.scene.grounds`."""
         scene, views = self.scene or scene, list[CameraView]()
         turns = any(group.setting == "environment.rotation" for group in self.groups)
         if surroundings_of(scene) is not None:

@@ -15,7 +15,7 @@ from advsearch.errors import InputError
 from advsearch.scene.camera_entries import PRESETS
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.validity import view_of
+from advsearch.scene.grounds import view_of
 
 
 def lens(scene: SceneDescription, to_world: torch.Tensor | None = None) -> np.ndarray:
