@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, Field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
@@ -140,3 +140,24 @@ def check_takes(what: str, function: Callable[..., object], *names: str) -> None
         return
     except TypeError as error:
         raise InputError(f"{what}: expected a function of ({', '.join(names)}): {error}") from None
+
+
+# ---- A configuration in words: named values with units, as controls say them and runs keep them ---------------------
+
+
+class Value(TypedDict):
+    """One value of a configuration."""
+
+    value: float | str
+    unit: str
+
+
+NOT_A_NUMBER = "not a number"  # what an output of a model is called that has NaN or infinity in it: it has said nothing
+OUT_OF_VIEW = "out of view"
+"""What a prediction is called where nothing of what is judged is in the picture. It is not a success of a search, and
+no share of right predictions counts it."""
+
+
+def rounded(number: float) -> str:
+    """Return a number that was worked out as sentences have it: with three significant digits."""
+    return f"{float(f'{number:.3g}'):g}"

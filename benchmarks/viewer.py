@@ -26,7 +26,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary

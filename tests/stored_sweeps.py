@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from samples import sweep
 
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.files import JsonValue
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.settings import SweepConfig

@@ -17,7 +17,7 @@ from torch import Tensor
 
 import advsearch
 from advsearch.config import SceneConfig
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.engine.loading import Scene
 from advsearch.engine.rendering import facts_about
 from advsearch.engine.verifier import kept_configuration

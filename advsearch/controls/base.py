@@ -27,8 +27,8 @@ from torch import Tensor
 
 from advsearch.controls.ranges import Fixed, Number, OneOf, Range, Slot, Spec, is_number, plain, read, same, shown
 from advsearch.copies import copied, hand_copies, is_ours
-from advsearch.described import Value as Value
-from advsearch.described import rounded
+from advsearch.options import Value as Value
+from advsearch.options import rounded
 from advsearch.distributions import as_setting
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import srgb_to_linear

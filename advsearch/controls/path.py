@@ -24,7 +24,7 @@ from torch import Tensor
 from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named
 from advsearch.controls.pose import euler
 from advsearch.controls.ranges import OneOf, Spec
-from advsearch.described import rounded
+from advsearch.options import rounded
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text
 from advsearch.scene.assets import Doubles

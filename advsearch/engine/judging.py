@@ -24,7 +24,7 @@ from advsearch.config import SceneConfig
 from advsearch.controls import Space
 from advsearch.controls.base import Control
 from advsearch.copies import copied
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.engine.loading import Scene
 from advsearch.engine.rendering import facts_about, pictures_of, render
 from advsearch.errors import InputError, UnknownNameError

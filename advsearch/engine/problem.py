@@ -20,7 +20,7 @@ from advsearch.attacks import Domain, Evaluation, Objective
 from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.engine.acceptance import ComparedView, view_of
 from advsearch.engine.judging import (
     ConfigurationInputs,

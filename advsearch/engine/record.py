@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks import SampleCount, SearchResult, Trials, Verification, count_right
 from advsearch.attacks.candidates import Bracket
-from advsearch.described import NOT_A_NUMBER, Value
+from advsearch.options import NOT_A_NUMBER, Value
 from advsearch.engine.transport import PredictedSearch
 from advsearch.interrupts import interruptible
 from advsearch.progress import Progress

@@ -15,7 +15,7 @@ from advsearch import seeds
 from advsearch.config import PICTURE_SPP, PICTURES, SceneConfig
 from advsearch.controls import compose
 from advsearch.controls.base import sentences
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonObject

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from advsearch.described import NOT_A_NUMBER
+from advsearch.options import NOT_A_NUMBER
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any, TypeGuard
 
-from advsearch.described import NOT_A_NUMBER, Value
+from advsearch.options import NOT_A_NUMBER, Value
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.files import JsonObject, JsonValue, open_regular, parse_json, read_text
 from advsearch.runs.files import placed_by, replacing, write_bytes, write_text

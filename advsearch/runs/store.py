@@ -16,7 +16,7 @@ from typing import Any, final, get_args, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue, parse_json
 from advsearch.runs.files import (

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.described import rounded
+from advsearch.options import rounded
 from advsearch.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from advsearch.described import Value
+    from advsearch.options import Value
     from advsearch.scene.settings import Parameter
 
 Floats = npt.NDArray[np.float32]

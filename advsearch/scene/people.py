@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.scene.settings import GEOMETRIC, Parameter, moving
 
 AGES = (10.0, 25.0, 90.0)  # years of MakeHuman's child, young and old

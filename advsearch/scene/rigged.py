@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.people import about

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from advsearch.copies import hand_copies
-from advsearch.described import NOT_A_NUMBER
+from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model

@@ -14,7 +14,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from advsearch.described import NOT_A_NUMBER
+from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.models import Model, find_label_set
 from advsearch.models.labels import fitting_labels, names_nothing

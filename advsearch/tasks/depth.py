@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.described import NOT_A_NUMBER, OUT_OF_VIEW
+from advsearch.options import NOT_A_NUMBER, OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.described import NOT_A_NUMBER, OUT_OF_VIEW
+from advsearch.options import NOT_A_NUMBER, OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.described import NOT_A_NUMBER, OUT_OF_VIEW
+from advsearch.options import NOT_A_NUMBER, OUT_OF_VIEW
 from advsearch.tasks.base import Facts, Mark, Prediction, Said
 from advsearch.tasks.classification import NO, ClassTask, Labels, members, target_lead, wrong_lead
 

@@ -13,7 +13,7 @@ from typing import Any, final
 import torch
 from torch import Tensor
 
-from advsearch.described import OUT_OF_VIEW
+from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model, Preprocessing

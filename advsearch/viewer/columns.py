@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from advsearch.described import OUT_OF_VIEW
+from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import FileFormatError
 from advsearch.runs.files import DAMAGED
 from advsearch.runs.store import NAME, Row

@@ -16,7 +16,7 @@ import yaml
 from samples import attack, gap, keep_object, make_run
 from stored_sweeps import make_sweep
 
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.store import Row

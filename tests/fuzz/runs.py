@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.runs.store import Row, Store
 from advsearch.settings import HEADER
 from fuzz import pictures

@@ -17,7 +17,7 @@ from covering import once_each
 from samples import GAP, REGION, SWEEP, attack, rated
 
 from advsearch.cli.main import main
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.runs import summary
 from advsearch.runs.directory import RunDirectory, find_run

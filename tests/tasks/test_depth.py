@@ -17,7 +17,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.attacks.objectives import get_objective
 from advsearch.cli.main import main
-from advsearch.described import NOT_A_NUMBER
+from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store

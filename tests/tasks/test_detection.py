@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.attacks.objectives import check_objective, get_objective
-from advsearch.described import NOT_A_NUMBER
+from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model
 from advsearch.tasks import Detection, Facts, Judgement, Prediction, Sight

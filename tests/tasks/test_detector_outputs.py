@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from advsearch.described import NOT_A_NUMBER
+from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.tasks import Detection, Prediction

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.attacks.objectives import get_objective
-from advsearch.described import NOT_A_NUMBER
+from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
 from advsearch.tasks import Facts, Prediction, Segmentation, Sight

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from stored_sweeps import make_sweep
 
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.tables import sweep_frame
 from advsearch.viewer.columns import NO_PROBABILITY, UNKNOWN, packed, read_columns

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult, count_right
 from advsearch.attacks.trials import MOST_TIMES, MOVED, OVER_LADDER
-from advsearch.described import OUT_OF_VIEW, Value
+from advsearch.options import OUT_OF_VIEW, Value
 from advsearch.engine.journal import Journal
 from advsearch.engine.judging import domain_of, print_terms
 from advsearch.engine.problem import Problem

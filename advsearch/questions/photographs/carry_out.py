@@ -19,7 +19,7 @@ from pydantic import JsonValue
 from advsearch import seeds
 from advsearch.attacks import clopper_pearson
 from advsearch.calls import helped
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.engine.judging import judgements
 from advsearch.engine.naming import in_turn
 from advsearch.engine.record import judged

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.attacks.units import per_unit, share_interval
-from advsearch.described import OUT_OF_VIEW
+from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.recipe.description import PHOTOGRAPHS

@@ -13,7 +13,7 @@ from advsearch import seeds
 from advsearch.attacks.domain import batches
 from advsearch.attacks.evaluation import most_at_once
 from advsearch.attacks.trials import clopper_pearson
-from advsearch.described import OUT_OF_VIEW
+from advsearch.options import OUT_OF_VIEW
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from advsearch.attacks.units import mean_interval
 from advsearch.controls import Control
 from advsearch.controls.path import WAY, PathControl
-from advsearch.described import OUT_OF_VIEW
+from advsearch.options import OUT_OF_VIEW
 from advsearch.engine.naming import given_to
 from advsearch.questions.attack.result import evenly, write_drive
 from advsearch.questions.sweep.axes import Axis

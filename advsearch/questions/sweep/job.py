@@ -14,7 +14,7 @@ from advsearch import seeds
 from advsearch.attacks import Evaluation, Query, Trials, run_trials
 from advsearch.attacks.domain import Seeds
 from advsearch.controls import Control, Space, make_control, make_space
-from advsearch.described import Value
+from advsearch.options import Value
 from advsearch.engine.journal import Journal, Sent, Shared
 from advsearch.engine.judging import Metrics, check_truth, domain_of, facts_of
 from advsearch.engine.loading import Scene, framed, make_renderer

@@ -17,7 +17,7 @@ import pandas as pd
 
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.units import paired_by_unit, per_unit, share_interval
-from advsearch.described import OUT_OF_VIEW
+from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import FileFormatError
 from advsearch.pictures import LARGEST_FILE, check_pixels, opened
 from advsearch.questions.sweep.figures import sweep_axes, sweep_figure

@@ -20,7 +20,7 @@ from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, draws_needed
 from advsearch.config import SceneConfig
-from advsearch.described import OUT_OF_VIEW
+from advsearch.options import OUT_OF_VIEW
 from advsearch.engine.journal import Journal, Shared, worker_call
 from advsearch.engine.problem import AWAY, Problem, as_claimed, changed
 from advsearch.engine.verifier import ladder_of
