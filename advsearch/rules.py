@@ -22,7 +22,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from advsearch import seeds
-from advsearch.attacks.units import fewer_by_chance, per_unit, share_interval
+from advsearch.attacks.trials import fewer_by_chance, per_unit, share_interval
 from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.runs.results import ConditionRow

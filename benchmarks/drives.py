@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from advsearch.attacks.units import fewer_by_chance, mean_interval, paired_by_unit, share_interval
+from advsearch.attacks.trials import fewer_by_chance, mean_interval, paired_by_unit, share_interval
 from advsearch.questions.explain.findings import find_importance
 from advsearch.rules import find_rules, halves
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import fisher_exact
 
 from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, mcnemar, paired_difference
-from advsearch.attacks.units import (
+from advsearch.attacks.trials import (
     fewer_by_chance,
     mean_interval,
     most_shown,

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks import clopper_pearson
-from advsearch.attacks.units import share_interval
+from advsearch.attacks.trials import share_interval
 from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.journal import worker_call
 from advsearch.errors import InputError

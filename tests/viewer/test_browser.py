@@ -577,7 +577,7 @@ def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Pat
 
 
 def test_intervals_over_drives_are_those_of_the_summary(browser: Browser) -> None:
-    from advsearch.attacks.units import share_interval
+    from advsearch.attacks.trials import share_interval
 
     code = asset("sweep.js")
     part, page = code[code.index("  const STAKES") : code.index("  function colour")], browser.new_page()

@@ -19,7 +19,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from advsearch import seeds
-from advsearch.attacks.units import paired_by_unit
+from advsearch.attacks.trials import paired_by_unit
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.question import Asked
 from advsearch.questions.compare.result import ComparedPair, CountOf, PairPart, PairPicture, PairRule

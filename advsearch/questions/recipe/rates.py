@@ -18,7 +18,7 @@ from pandas.api.types import is_numeric_dtype
 from pydantic import BaseModel, ConfigDict, Field
 
 from advsearch.attacks.trials import CONFIDENCE
-from advsearch.attacks.units import per_unit, share_interval
+from advsearch.attacks.trials import per_unit, share_interval
 from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.questions.attack.summary import AttackSummary

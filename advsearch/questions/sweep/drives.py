@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.attacks.units import mean_interval
+from advsearch.attacks.trials import mean_interval
 from advsearch.controls import Control
 from advsearch.controls.path import WAY, PathControl
 from advsearch.options import OUT_OF_VIEW

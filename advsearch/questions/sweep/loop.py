@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.attacks.domain import batches
-from advsearch.attacks.units import most_shown
+from advsearch.attacks.trials import most_shown
 from advsearch.cluster import Executor, InProcess
 from advsearch.engine.journal import Journal, Sent, Shared, finite, lost, other_numbers, same, worker_call
 from advsearch.engine.loading import framed

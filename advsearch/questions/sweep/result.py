@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from advsearch.attacks import clopper_pearson
-from advsearch.attacks.units import paired_by_unit, per_unit, share_interval
+from advsearch.attacks.trials import paired_by_unit, per_unit, share_interval
 from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import FileFormatError
 from advsearch.pictures import LARGEST_FILE, check_pixels, opened
