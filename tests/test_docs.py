@@ -35,7 +35,7 @@ from advsearch.cli.export import WRITERS
 from advsearch.cli.flags import config_from
 from advsearch.cli.main import _parse
 from advsearch.config import CONFIGS, RenderConfig, SceneConfig
-from advsearch.engine.acceptance import compared, view_of
+from advsearch.engine.problem import compared, view_of
 from advsearch.engine.loading import as_controls
 from advsearch.engine.naming import check_run_settings, given_to
 from advsearch.files import MESHES

@@ -14,7 +14,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation, Policy
 from advsearch.attacks.evaluation import Query
-from advsearch.engine.acceptance import VIEWS, ComparedView, Deviation
+from advsearch.engine.problem import VIEWS, ComparedView, Deviation
 from advsearch.engine.bank import stratified
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import PredictedSearch

@@ -12,7 +12,8 @@ from stand_ins import Impatient, rows, shared
 
 import advsearch
 from advsearch.attacks.domain import Block, Domain
-from advsearch.engine import acceptance, bank
+from advsearch.engine import bank
+from advsearch.engine import problem
 from advsearch.engine.bank import Bank, stratified
 from advsearch.engine.problem import hard_first
 from advsearch.errors import ClusterError

@@ -14,8 +14,8 @@ from stand_ins import rows
 import advsearch
 from advsearch.attacks.domain import Product
 from advsearch.cluster import Done, Workforce
-from advsearch.engine import acceptance
-from advsearch.engine.acceptance import Deviation
+from advsearch.engine import problem
+from advsearch.engine.problem import Deviation
 from advsearch.engine.journal import worker_call
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import predicting
