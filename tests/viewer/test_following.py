@@ -13,7 +13,7 @@ from stored_sweeps import described, serving
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
-from advsearch.viewer.dashboard import START, following_page, is_under_way, progress_json
+from advsearch.viewer.server import START, following_page, is_under_way, progress_json
 
 
 def step(run: RunDirectory, number: int, *, picture: bool = True) -> None:

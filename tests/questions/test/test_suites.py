@@ -45,7 +45,7 @@ from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.scene.assets import linear_to_srgb
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
-from advsearch.viewer.dashboard import following_page
+from advsearch.viewer.server import following_page
 
 EASY, HARD = "small_models:easy", "small_models:hard"
 SMALL: dict[str, Any] = {"resolution": 32, "denoise": "none"}
