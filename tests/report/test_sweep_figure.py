@@ -7,7 +7,7 @@ import io
 import imageio.v3 as iio
 from samples import sweep
 
-from advsearch.questions.sweep.figures import sweep_figure
+from advsearch.questions.sweep.display import sweep_figure
 
 
 def test_the_names_of_files_fit_the_map_of_a_sweep() -> None:

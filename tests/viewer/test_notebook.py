@@ -18,7 +18,7 @@ from samples import CURVE, GAP, sweep
 
 from advsearch.questions.attack.summary import CurveResult
 from advsearch.questions.gap import GapResult
-from advsearch.questions.sweep.figures import sweep_axes
+from advsearch.questions.sweep.display import sweep_axes
 from advsearch.report.figures import search_axes
 from advsearch.report.shown import side_by_side
 

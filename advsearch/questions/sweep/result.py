@@ -20,7 +20,7 @@ from advsearch.attacks.trials import paired_by_unit, per_unit, share_interval
 from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import FileFormatError
 from advsearch.pictures import LARGEST_FILE, check_pixels, opened
-from advsearch.questions.sweep.figures import sweep_axes, sweep_figure
+from advsearch.questions.sweep.display import sweep_axes, sweep_figure
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.summary import AxisRow, CountedPredictions, MapAxis, PairedRates, SweepMap, SweepSummary
