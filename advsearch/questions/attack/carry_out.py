@@ -41,7 +41,7 @@ from advsearch.models.address import AskedModel
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.attack import settings as numbers
-from advsearch.questions.attack.ambient import problems_by_name
+from advsearch.questions.attack.stages import problems_by_name
 from advsearch.questions.attack.outcome import summarise
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
