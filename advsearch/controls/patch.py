@@ -27,7 +27,7 @@ from scipy import spatial
 from torch import Tensor
 
 from advsearch.controls.base import LARGEST_EPSILON, NOTHING, Choice, Control, Moved, Value, Values, changed, number
-from advsearch.controls.corruption import picture, planes, resized
+from advsearch.controls.corruption_filters import picture, planes, resized
 from advsearch.controls.ranges import Fixed, OneOf, Range, Slot, Spec
 from advsearch.controls.texture import radius, resampled
 from advsearch.errors import FileFormatError, InputError

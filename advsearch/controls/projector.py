@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from advsearch.controls.base import LARGEST_EPSILON, Choice, Value, Values, measure, number
-from advsearch.controls.corruption import picture, planes
+from advsearch.controls.corruption_filters import picture, planes
 from advsearch.controls.patch import PRINT_SIDE, PictureControl, enlarged
 from advsearch.controls.ranges import Fixed, Range
 from advsearch.controls.texture import NORMS, radius

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import LARGEST_EPSILON, NOTHING, Choice, Control, Parameter, Value, changed
-from advsearch.controls.corruption import resized
+from advsearch.controls.corruption_filters import resized
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Bools, Floats
 from advsearch.scene.assets import srgb_to_linear
