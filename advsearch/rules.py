@@ -23,8 +23,8 @@ import pandas as pd
 
 from advsearch import seeds
 from advsearch.attacks.trials import fewer_by_chance, per_unit, share_interval
-from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import InputError
+from advsearch.options import OUT_OF_VIEW
 from advsearch.runs.results import ConditionRow
 
 Mask = npt.NDArray[np.bool_]

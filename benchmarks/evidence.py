@@ -27,8 +27,7 @@ import numpy as np
 import yaml
 from scipy.stats import beta, binom, binomtest, norm
 
-from advsearch.attacks.trials import ConfidenceSequence
-from advsearch.attacks.trials import mean_interval, share_interval
+from advsearch.attacks.trials import ConfidenceSequence, mean_interval, share_interval
 from advsearch.cli.main import main as advsearch
 from advsearch.report.wording import interval_text, number_text, percent
 from advsearch.runs.store import Row, Store

@@ -20,7 +20,7 @@ With `--sweep`, of a sweep over azimuth, elevation and distance that is predicte
 seeds: rows a second, light and comparisons included, and how often that is of the rendered ones (asked for: 5); the
 accuracy; and in how many rows the verdict is not that of the rendered ones, and how many differ between these.
 
-With `--rule`, how often the comparison before a search accepts predictions (`engine.acceptance`): by simulation; and as
+With `--rule`, how often the comparison before a search accepts predictions (`engine.problem`): by simulation; and as
 they are, and with mistakes planted in them, for `--views` searches, near and from afar, where the object is small.
 
 With `--viewpoints`, the search of the recipe of that name up to its verified result, predicted, and rendered where the
@@ -52,8 +52,8 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.engine.problem import VIEWS, ComparedView, Deviation, compared, view_of  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
+from advsearch.engine.problem import VIEWS, ComparedView, Deviation, compared, view_of  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.questions.attack.carry_out import attack_once  # noqa: E402

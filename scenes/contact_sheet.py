@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.bundled.objects import HOUSEHOLD, OBJECTS
-from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
-from advsearch.scene.assets import linear_to_srgb
+from advsearch.scene.assets import EnvironmentAsset, ObjectAsset, linear_to_srgb
 from advsearch.scene.parts import mesh_part
 from scenes.environments import ENVIRONMENTS
 
@@ -37,9 +36,8 @@ def picture(
     """Render an object on a brown ground plane; (size, size, 3) display-referred sRGB. Angles in degrees."""
     import torch
 
-    from advsearch.scene.mitsuba_backend.variant import denoise
     from advsearch.scene.mitsuba_backend.meshes import mitsuba_mesh, principled
-    from advsearch.scene.mitsuba_backend.variant import mitsuba
+    from advsearch.scene.mitsuba_backend.variant import denoise, mitsuba
 
     mi = mitsuba()
     transform = mi.ScalarTransform4f

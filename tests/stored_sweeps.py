@@ -13,8 +13,8 @@ import numpy as np
 import pandas as pd
 from samples import sweep
 
-from advsearch.options import Value
 from advsearch.files import JsonValue
+from advsearch.options import Value
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.rules import observed

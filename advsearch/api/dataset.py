@@ -17,7 +17,6 @@ from torch import Tensor
 
 import advsearch
 from advsearch.config import SceneConfig
-from advsearch.options import Value
 from advsearch.engine.loading import Scene
 from advsearch.engine.rendering import facts_about
 from advsearch.engine.verifier import kept_configuration
@@ -25,6 +24,7 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject
 from advsearch.models import find_label_set
 from advsearch.models.labels import names_nothing
+from advsearch.options import Value
 from advsearch.progress import Progress
 from advsearch.questions.attack.carry_out import SEARCHED_WITH, parts_in, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig

@@ -37,9 +37,9 @@ from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
 from advsearch.runs.files import read_png
 from advsearch.runs.results import RenderResult, Result
 from advsearch.runs.summary import read_configuration, read_result
+from advsearch.scene.formation import aovs_of
 from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.hdr import read_exr
-from advsearch.scene.formation import aovs_of
 from advsearch.tasks import AnyTask, make_task
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Distribution, Domain
 from advsearch.copies import hand_copies
-from advsearch.options import Value
 from advsearch.errors import InputError
+from advsearch.options import Value
 from advsearch.seeds import stream
 from advsearch.tasks import Judgement
 

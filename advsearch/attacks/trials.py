@@ -450,10 +450,10 @@ def moved(here: Floats, below: Floats) -> float:
 #
 #     K(m, c) = prod_u (1 - c o_u / O + c k_u / (O m))
 #
-# So K exceeds 2 / a with a probability of a / 2 at most (Markov), whatever units are like and however few there are, also
-# where each has a share of its own (the product's mean is at most 1, by the inequality of the means). These are the bets
-# of `trials.ConfidenceSequence`, whose stakes they take. Where each unit has one prediction, the exact tests of
-# independent ones are taken, which are sharper: Clopper and Pearson, Newcombe, McNemar.
+# So K exceeds 2 / a with a probability of a / 2 at most (Markov), whatever units are like and however few there are,
+# also where each has a share of its own (the product's mean is at most 1, by the inequality of the means). These are
+# the bets of `trials.ConfidenceSequence`, whose stakes they take. Where each unit has one prediction, the exact tests
+# of independent ones are taken, which are sharper: Clopper and Pearson, Newcombe, McNemar.
 
 Numbers = npt.NDArray[np.float64]
 Units = npt.NDArray[np.int64]

@@ -14,8 +14,8 @@ from typing import NamedTuple
 from advsearch.cli import output
 from advsearch.cli.main import argument, command
 from advsearch.cli.output import at_work, output_errors
-from advsearch.options import rounded
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.options import rounded
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.export import FORMATS, write_rows, write_threedb
 from advsearch.runs.files import placed_by, replacing

@@ -27,10 +27,10 @@ from torch import Tensor
 
 from advsearch.controls.ranges import Fixed, Number, OneOf, Range, Slot, Spec, is_number, plain, read, same, shown
 from advsearch.copies import copied, hand_copies, is_ours
-from advsearch.options import Value as Value
-from advsearch.options import rounded
 from advsearch.distributions import as_setting
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.options import Value as Value
+from advsearch.options import rounded
 from advsearch.scene.assets import srgb_to_linear
 from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription, check_one_environment
 from advsearch.scene.gradients import WHOLE_RANGE as WHOLE_RANGE

@@ -24,9 +24,9 @@ from torch import Tensor
 from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named
 from advsearch.controls.pose import euler
 from advsearch.controls.ranges import OneOf, Spec
-from advsearch.options import rounded
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import read_text
+from advsearch.options import rounded
 from advsearch.scene.assets import Doubles
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import affine, camera_to_world, middle, object_to_world

@@ -24,21 +24,20 @@ from advsearch.config import SceneConfig
 from advsearch.controls import Space
 from advsearch.controls.base import Control
 from advsearch.copies import copied
-from advsearch.options import Value
 from advsearch.engine.loading import Scene
 from advsearch.engine.rendering import facts_about, pictures_of, render
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.features import features_of
-from advsearch.options import check_takes
+from advsearch.options import Value, check_takes
 from advsearch.registry import check_import, current_directory_importable
 from advsearch.report.wording import seen_text
 from advsearch.runs.export import AFTER, OWN
 from advsearch.runs.results import PrintTerms
 from advsearch.scene.description import OBJECT
-from advsearch.scene.renderer import Renderer
 from advsearch.scene.formation import Surfaces
+from advsearch.scene.renderer import Renderer
 from advsearch.scene.things import ALL
 from advsearch.tasks import Facts, Judgement, Task
 from advsearch.tasks.base import Output, Truth, mean

@@ -49,9 +49,9 @@ from advsearch.tasks.base import Output, Truth, mean, typical
 # Whether predicted pictures may take the place of rendered ones: the one rule for matrices, basis pictures and light
 # on surfaces, in searches and sweeps (docs/surface-light.md, "How far off predictions may be").
 #
-# A few *views* are traced beside predicted ones. Noise averages out over a search, and bias does not: a search climbs it.
-# So a prediction may be as noisy as a rendered picture, on the object alone, which may be small; and on average over the
-# views it may not move the margin, but for a small part of what the search has moved it.
+# A few *views* are traced beside predicted ones. Noise averages out over a search, and bias does not: a search climbs
+# it. So a prediction may be as noisy as a rendered picture, on the object alone, which may be small; and on average
+# over the views it may not move the margin, but for a small part of what the search has moved it.
 
 FIRST, VIEWS = 2, 6  # views that are compared at first, and in all where these don't decide
 MARGIN = 0.3  # mean difference of the margin over the views, with its sign, that is accepted (of a classifier: logits)

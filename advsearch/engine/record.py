@@ -14,9 +14,9 @@ from torch import Tensor
 
 from advsearch.attacks import SampleCount, SearchResult, Trials, Verification, count_right
 from advsearch.attacks.candidates import Bracket
-from advsearch.options import NOT_A_NUMBER, Value
 from advsearch.engine.transport import PredictedSearch
 from advsearch.interrupts import interruptible
+from advsearch.options import NOT_A_NUMBER, Value
 from advsearch.progress import Progress
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory

@@ -15,23 +15,22 @@ from advsearch import seeds
 from advsearch.config import PICTURE_SPP, PICTURES, SceneConfig
 from advsearch.controls import compose
 from advsearch.controls.base import sentences
-from advsearch.options import Value
 from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonObject
 from advsearch.models import Model, load_model
 from advsearch.models.guards import plainly
+from advsearch.options import Value
 from advsearch.progress import Watched, watcher
 from advsearch.report.figures import contact_sheet, marked
 from advsearch.report.wording import seen_text
 from advsearch.runs.files import placed_by, png_bytes, write_exr, write_layers, write_png
 from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewPredictions
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import SAMPLER, ImageFormation, to_8_bit
+from advsearch.scene.formation import SAMPLER, ImageFormation, Surfaces, to_8_bit
 from advsearch.scene.outlines import seen_things
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA
-from advsearch.scene.formation import Surfaces
 from advsearch.scene.things import ALL
 from advsearch.settings import as_python
 from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, make_task

@@ -1,5 +1,5 @@
 """Searches whose pictures are predicted; here: by a matrix of light transport, where nothing varies by chance. Every
-`EVERY` evaluations predictions are compared with traced pictures: where they are too far off (`engine.acceptance`), the
+`EVERY` evaluations predictions are compared with traced pictures: where they are too far off (`engine.problem`), the
 matrix is made anew. The ranking and all trials trace paths."""
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.engine.problem import ComparedView, Deviation, compared
-from advsearch.engine.problem import Problem
+from advsearch.engine.problem import ComparedView, Deviation, Problem, compared
 from advsearch.runs.results import BankOfConditions, LinearTransport, PredictionError
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.predictor import NOISE, Predictor

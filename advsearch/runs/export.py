@@ -14,9 +14,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any, TypeGuard
 
-from advsearch.options import NOT_A_NUMBER, Value
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.files import JsonObject, JsonValue, open_regular, parse_json, read_text
+from advsearch.options import NOT_A_NUMBER, Value
 from advsearch.runs.files import placed_by, replacing, write_bytes, write_text
 from advsearch.runs.store import Row, Store
 

@@ -16,9 +16,9 @@ from typing import Any, final, get_args, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from advsearch.options import Value
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue, parse_json
+from advsearch.options import Value
 from advsearch.runs.files import (
     DAMAGED,
     check_schema,

@@ -17,8 +17,8 @@ import pandas as pd
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import FileFormatError
+from advsearch.options import NOT_A_NUMBER
 from advsearch.runs.export import as_columns, as_record, each_value
 from advsearch.runs.store import NAME, Row, Store
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.options import rounded
 from advsearch.errors import InputError
+from advsearch.options import rounded
 
 if TYPE_CHECKING:
     from torch import Tensor

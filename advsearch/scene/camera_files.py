@@ -18,8 +18,7 @@ from advsearch.errors import FileFormatError
 from advsearch.files import MESHES, parse_json, parsed, present_text
 from advsearch.scene.camera_entries import Entries, made, nothing, number, plain, with_told
 from advsearch.scene.camera_model import BROWN_CONRADY, COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, CameraModel
-from advsearch.scene.importing.files import shown
-from advsearch.scene.importing.files import CAMERAS
+from advsearch.scene.importing.files import CAMERAS, shown
 from advsearch.yaml_text import LARGEST, parse_yaml
 
 LARGEST_JSON = 1 << 25  # bytes of a JSON file, which may hold the pose of every picture

@@ -147,14 +147,14 @@ DUSK = 70.0  # illuminance of the open sky at which street lamps are switched on
 # ---------------------------------------------------------------------------------------------------------------------
 # How far and how high a camera may go before the picture around a scene no longer fits the ground that is laid in it.
 #
-# The map of a street, or a photograph of your own, is one picture, taken from a height h0 above the place of the object.
-# The renderer shows it as if it were infinitely far away; only the ground is laid as a plane. From elsewhere:
+# The map of a street, or a photograph of your own, is one picture, taken from a height h0 above the place of the
+# object. The renderer shows it as if it were infinitely far away; only the ground is laid as a plane. From elsewhere:
 #
 # - What stands at a distance R behind the object is seen as large as from there, and would be seen R / (R + d) times as
 #   large from a camera that is d away. Up to d = R it is at most twice too large.
-# - Where the ground ends at a distance G from the object, on the side of the camera, the picture shows ground of its own
-#   nearer than that end, and the feet of what stands around below it. A camera of height h whose picture ends b degrees
-#   below the horizon sees nothing nearer than h / tan(b): up to d = G + h / tan(b) the end is out of sight.
+# - Where the ground ends at a distance G from the object, on the side of the camera, the picture shows ground of its
+#   own nearer than that end, and the feet of what stands around below it. A camera of height h whose picture ends b
+#   degrees below the horizon sees nothing nearer than h / tan(b): up to d = G + h / tan(b) the end is out of sight.
 # - From a height h, the foot of what stands at R is h / R below the horizon, and is shown h0 / R below it. Up to
 #   h = 2 h0 it is at most twice too high.
 

@@ -29,13 +29,12 @@ from advsearch.errors import InputError
 from advsearch.pictures import png_of
 from advsearch.scene.assembly import ON_PICTURE, Motion, central
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import ImageFormation, Later, Moment, levels_of
+from advsearch.scene.formation import ImageFormation, Later, Moment, Surfaces, levels_of
 from advsearch.scene.geometry import camera_to_world, middle
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_order, first_plan, steps_for
-from advsearch.scene.mitsuba_backend.variant import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.variant import denoise
 from advsearch.scene.rig import Mount
-from advsearch.scene.formation import Surfaces
 
 MAX_SPP = 65536
 Configuration = Tensor | npt.NDArray[np.floating[Any]] | Sequence[float]  # a point of the unit box

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.options import Value
 from advsearch.errors import InputError
+from advsearch.options import Value
 from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.people import about
 from advsearch.scene.settings import GEOMETRIC, Parameter, moving

@@ -19,11 +19,10 @@ import torch
 from torch import Tensor
 
 from advsearch.copies import hand_copies
-from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
-from advsearch.options import FROM_RUN
+from advsearch.options import FROM_RUN, NOT_A_NUMBER
 
 Output = Any  # what a model returns for N pictures: a tensor (N, ...), or a list with one thing for each picture
 Truth = Any  # what is true of a scene, as its task needs it: the right classes, a number, boxes

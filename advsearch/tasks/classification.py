@@ -14,11 +14,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.models import Model, find_label_set
 from advsearch.models.labels import fitting_labels, names_nothing
-from advsearch.options import FROM_RUN
+from advsearch.options import FROM_RUN, NOT_A_NUMBER
 from advsearch.tasks.base import Facts, Judgement, Output, Prediction, Task
 
 Labels = tuple[int, ...]

@@ -18,11 +18,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.options import NOT_A_NUMBER, OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
-from advsearch.options import FROM_RUN
+from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW
 from advsearch.tasks.base import Facts, Mark, Prediction, Said, Task
 
 ASIDE = 0.1  # cosine of the angle to the camera's axis from which on z-depth is no distance any more

@@ -15,12 +15,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.options import NOT_A_NUMBER, OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.models.labels import names_nothing
-from advsearch.options import FROM_RUN
+from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW
 from advsearch.tasks import detector_outputs as outputs
 from advsearch.tasks.base import Facts, Mark, Prediction, Said
 from advsearch.tasks.boxes import (

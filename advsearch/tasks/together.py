@@ -13,13 +13,12 @@ from typing import Any, final
 import torch
 from torch import Tensor
 
-from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model, Preprocessing
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.model import joined
-from advsearch.options import FROM_RUN, JOINED
+from advsearch.options import FROM_RUN, JOINED, OUT_OF_VIEW
 from advsearch.tasks.base import Facts, Judgement, Mark, Output, Prediction, Said, Task, Truth, mean
 from advsearch.tasks.command import Command
 

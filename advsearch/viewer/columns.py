@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import FileFormatError
+from advsearch.options import OUT_OF_VIEW
 from advsearch.runs.files import DAMAGED
 from advsearch.runs.store import NAME, Row
 

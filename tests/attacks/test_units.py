@@ -9,12 +9,15 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import fisher_exact
 
-from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, mcnemar, paired_difference
 from advsearch.attacks.trials import (
+    ConfidenceSequence,
+    clopper_pearson,
     fewer_by_chance,
+    mcnemar,
     mean_interval,
     most_shown,
     paired_by_unit,
+    paired_difference,
     per_unit,
     share_interval,
 )

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from advsearch.bundled.objects import HOUSEHOLD, OBJECTS, STREET
-from advsearch.bundled.objects.textures import Draw
 from advsearch.bundled.objects.shapes import carved, grid
+from advsearch.bundled.objects.textures import Draw
 from advsearch.errors import UnknownNameError
 from advsearch.scene import library
 from advsearch.scene.assets import Mesh, ObjectAsset, normalised

@@ -30,8 +30,8 @@ from advsearch.cli.main import COMMANDS, help_of, main
 from advsearch.cli.output import aligned, finish
 from advsearch.cli.output import shown_text as text_of
 from advsearch.controls.base import Choice
-from advsearch.options import Value
 from advsearch.errors import InputError, StorageError
+from advsearch.options import Value
 from advsearch.progress import BarProgress, LineProgress, NullProgress, Progress, watched
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.gap import GapConfig

@@ -14,9 +14,9 @@ from stand_ins import rows
 import advsearch
 from advsearch.attacks.domain import Product
 from advsearch.cluster import Done, Workforce
-from advsearch.engine import problem
-from advsearch.engine.problem import Deviation
+from advsearch.engine import problem as problems
 from advsearch.engine.journal import worker_call
+from advsearch.engine.problem import Deviation
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import predicting
 from advsearch.questions.sweep.carry_out import job_of
@@ -42,7 +42,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[SurfaceRenderer]]:
         monkeypatch.setattr(arrangement, name, value)
     monkeypatch.setattr(predicting, "PAYS", 0.0)
     for name, number in {"CHECK_SPP": 2, "BOUND": 50.0, "MARGIN": 50.0}.items():
-        monkeypatch.setattr(acceptance, name, number)
+        monkeypatch.setattr(problems, name, number)
     made, make = list[SurfaceRenderer](), SurfaceRenderer.__init__
 
     def counted(self: SurfaceRenderer, *given: Any) -> None:

@@ -17,8 +17,8 @@ from stored_sweeps import described
 import advsearch
 from advsearch.attacks.trials import mcnemar, paired_difference
 from advsearch.cli.main import main
-from advsearch.options import Value
 from advsearch.errors import FileFormatError, InputError
+from advsearch.options import Value
 from advsearch.questions.compare import CompareConfig
 from advsearch.questions.compare.result import ComparedPair, CompareResult
 from advsearch.questions.report.evidence import claims_of

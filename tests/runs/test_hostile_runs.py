@@ -17,8 +17,8 @@ from covering import once_each
 from samples import GAP, REGION, SWEEP, attack, rated
 
 from advsearch.cli.main import main
-from advsearch.options import Value
 from advsearch.errors import AdvsearchError, FileFormatError
+from advsearch.options import Value
 from advsearch.runs import summary
 from advsearch.runs.directory import RunDirectory, find_run
 from advsearch.runs.files import read_png, write_text

@@ -133,7 +133,7 @@ def test_a_tracker_that_hangs_does_not_hold_a_run_up(
 ) -> None:
     ended = threading.Event()
     monkeypatch.setattr(sys.modules["mlflow"], "log_metrics", lambda *args, **kwargs: ended.wait(30))
-    monkeypatch.setattr(tracking, "PATIENCE", 0.05)
+    monkeypatch.setattr(directory, "PATIENCE", 0.05)
     run_of(tmp_path / "run", "mlflow")
     assert ("end_run",) not in told
     ended.set()

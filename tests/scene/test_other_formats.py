@@ -10,8 +10,8 @@ import pytest
 
 from advsearch.errors import FileFormatError
 from advsearch.files import MESHES
-from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.files import BLENDER_READS, SAID, advice
+from advsearch.scene.importing.objects import import_object
 
 ENDINGS = [one for _, endings in BLENDER_READS.values() for one in endings]
 ENDINGS += [one for _, endings in SAID.values() for one in endings]

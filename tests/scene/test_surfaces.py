@@ -12,8 +12,8 @@ import torch
 from advsearch.engine.loading import load_scene
 from advsearch.errors import UnknownNameError
 from advsearch.runs.files import write_layers
-from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.formation import AOVS, CHANNELS, Surfaces, aovs_of
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 
 SIZE = 32
 

@@ -12,9 +12,9 @@ from advsearch.controls import make_control, make_space
 from advsearch.engine.loading import Scene, framed, load_scene
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.grounds import CameraView, Surroundings, past, surroundings_of, valid, view_of
 from advsearch.scene.library import load_environment, load_object
 from advsearch.scene.places.quads import EDGES, EYE, LENGTH
-from advsearch.scene.grounds import CameraView, Surroundings, past, surroundings_of, valid, view_of
 
 SIDE = 96
 FAR_SIDE = 90.0

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.attacks.objectives import get_objective
 from advsearch.cli.main import main
-from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
+from advsearch.options import NOT_A_NUMBER
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Depth, Facts, Sight, make_task

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.attacks.objectives import check_objective, get_objective
-from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model
+from advsearch.options import NOT_A_NUMBER
 from advsearch.tasks import Detection, Facts, Judgement, Prediction, Sight
 from advsearch.tasks.boxes import Place, corners, left_over, log_odds, overlap, share_inside
 from advsearch.tasks.detection import GOALS

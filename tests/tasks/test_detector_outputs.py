@@ -12,9 +12,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.models import load_model
+from advsearch.options import NOT_A_NUMBER
 from advsearch.tasks import Detection, Prediction
 from advsearch.tasks.boxes import Detections, Place
 from advsearch.tasks.detector_outputs import detections_in, settled

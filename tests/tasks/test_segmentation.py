@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.attacks.objectives import get_objective
-from advsearch.options import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
+from advsearch.options import NOT_A_NUMBER
 from advsearch.tasks import Facts, Prediction, Segmentation, Sight
 from advsearch.tasks.segmentation import Region
 

@@ -13,10 +13,9 @@ import numpy as np
 from scipy.special import logsumexp
 
 import advsearch.bundled.objects.shapes as shapes
-from advsearch.bundled.objects.textures import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family
 from advsearch.bundled.objects.shapes import Array, Patch
-from advsearch.bundled.objects.textures import Paint, Texels, mix, painter, solid, step
+from advsearch.bundled.objects.textures import Draw, Paint, Texels, hexed, mix, painter, solid, step
 from advsearch.scene.assets import Material
 
 AXLES = (1.29, -1.33)

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.bundled.objects.textures import Draw
 from advsearch.bundled.objects.shapes import Array, Patch
-from advsearch.bundled.objects.textures import Paint, Texels
+from advsearch.bundled.objects.textures import Draw, Paint, Texels
 from advsearch.scene.assets import Material, Mesh, MeshRig, ObjectAsset, footing
 from advsearch.scene.library import BUNDLED_OBJECT, finished
 

@@ -7,16 +7,17 @@ from itertools import product
 import numpy as np
 
 import advsearch.bundled.objects.shapes as shapes
-from advsearch.bundled.objects.textures import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family, finish
 from advsearch.bundled.objects.shapes import Array, Patch
 from advsearch.bundled.objects.textures import (
+    Draw,
     Paint,
     between,
     checks,
     clouded,
     dots,
     gradient,
+    hexed,
     natural,
     over,
     rings,

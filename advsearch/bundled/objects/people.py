@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from advsearch.bundled.objects.textures import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family
 from advsearch.bundled.objects.shapes import Array, Patch, Rest
-from advsearch.bundled.objects.textures import Texels, mix, noise, painter, step
+from advsearch.bundled.objects.textures import Draw, Texels, hexed, mix, noise, painter, step
 from advsearch.scene.assets import Material, face_vectors
 from advsearch.scene.people import Person, body_data
 

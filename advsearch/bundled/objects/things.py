@@ -9,14 +9,15 @@ from itertools import combinations
 import numpy as np
 
 import advsearch.bundled.objects.shapes as shapes
-from advsearch.bundled.objects.textures import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family, finish
 from advsearch.bundled.objects.shapes import Array, Patch
 from advsearch.bundled.objects.textures import (
+    Draw,
     Paint,
     Texels,
     anything,
     clouded,
+    hexed,
     mix,
     natural,
     noise,

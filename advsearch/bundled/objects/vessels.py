@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 import advsearch.bundled.objects.shapes as shapes
-from advsearch.bundled.objects.textures import Draw, hexed
 from advsearch.bundled.objects.family import Instance, family, finish
 from advsearch.bundled.objects.shapes import Array, Patch
 from advsearch.bundled.objects.textures import (
+    Draw,
     Paint,
     Texels,
     anything,
@@ -18,6 +18,7 @@ from advsearch.bundled.objects.textures import (
     dots,
     facing,
     gradient,
+    hexed,
     mottled,
     natural,
     over,

@@ -41,16 +41,14 @@ from advsearch.models.address import AskedModel
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.attack import settings as numbers
-from advsearch.questions.attack.stages import problems_by_name
 from advsearch.questions.attack.outcome import summarise
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.stages import Attack
+from advsearch.questions.attack.stages import Attack, problems_by_name
 from advsearch.report.wording import count
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
 from advsearch.runs.directory import only_here as only_python_has
-from advsearch.scene.formation import EVERYTHING, NOTHING, next_count
-from advsearch.scene.formation import aovs_of
+from advsearch.scene.formation import EVERYTHING, NOTHING, aovs_of, next_count
 from advsearch.scene.things import ALL
 from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, OwnTask, Task, function_of, make_task

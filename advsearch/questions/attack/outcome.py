@@ -11,12 +11,12 @@ from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult, count_right
 from advsearch.attacks.trials import MOST_TIMES, MOVED, OVER_LADDER
-from advsearch.options import OUT_OF_VIEW, Value
 from advsearch.engine.journal import Journal
 from advsearch.engine.judging import domain_of, print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages, control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.transport import remark
+from advsearch.options import OUT_OF_VIEW, Value
 from advsearch.questions.attack import result as kept
 from advsearch.questions.attack.result import AttackResult, KeptPicture
 from advsearch.questions.attack.settings import AttackConfig

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from advsearch import seeds, threads
 from advsearch.models import Model
-from advsearch.models.reference import Augmentation
-from advsearch.models.reference import Trainable
+from advsearch.models.reference import Augmentation, Trainable
 from advsearch.questions.harden import lessons
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson, surprise, with_worst
 from advsearch.questions.harden.result import PLAIN_SCENES, RENDERED_SCENES

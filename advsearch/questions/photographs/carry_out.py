@@ -19,7 +19,6 @@ from pydantic import JsonValue
 from advsearch import seeds
 from advsearch.attacks import clopper_pearson
 from advsearch.calls import helped
-from advsearch.options import Value
 from advsearch.engine.judging import judgements
 from advsearch.engine.naming import in_turn
 from advsearch.engine.record import judged
@@ -27,6 +26,7 @@ from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
+from advsearch.options import Value
 from advsearch.questions.attack.carry_out import judged_alone, problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.photographs import result

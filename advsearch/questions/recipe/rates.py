@@ -17,10 +17,9 @@ import pandas as pd
 from pandas.api.types import is_numeric_dtype
 from pydantic import BaseModel, ConfigDict, Field
 
-from advsearch.attacks.trials import CONFIDENCE
-from advsearch.attacks.trials import per_unit, share_interval
-from advsearch.options import OUT_OF_VIEW
+from advsearch.attacks.trials import CONFIDENCE, per_unit, share_interval
 from advsearch.errors import InputError
+from advsearch.options import OUT_OF_VIEW
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.recipe.description import PHOTOGRAPHS
 from advsearch.questions.sweep.display import surface_sentences

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from advsearch.attacks.trials import mean_interval
 from advsearch.controls import Control
 from advsearch.controls.path import WAY, PathControl
-from advsearch.options import OUT_OF_VIEW
 from advsearch.engine.naming import given_to
+from advsearch.options import OUT_OF_VIEW
 from advsearch.questions.attack.result import evenly, write_drive
 from advsearch.questions.sweep.axes import Axis
 from advsearch.questions.sweep.job import Job, OpenScenes

@@ -14,7 +14,6 @@ from advsearch import seeds
 from advsearch.attacks import Evaluation, Query, Trials, run_trials
 from advsearch.attacks.domain import Seeds
 from advsearch.controls import Control, Space, make_control, make_space
-from advsearch.options import Value
 from advsearch.engine.journal import Journal, Sent, Shared
 from advsearch.engine.judging import Metrics, check_truth, domain_of, facts_of
 from advsearch.engine.loading import Scene, framed, make_renderer
@@ -23,6 +22,7 @@ from advsearch.engine.record import Stages, rate_of
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.options import Value
 from advsearch.questions.sweep.axes import Axis, Drawn, Points, on_grid
 from advsearch.questions.sweep.predicting import PredictedSweep, SweptPicture
 from advsearch.questions.sweep.settings import SweepConfig

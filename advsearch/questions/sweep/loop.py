@@ -23,8 +23,8 @@ from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
 from advsearch.questions.attack.result import save_marked
 from advsearch.questions.sweep import summary as results
-from advsearch.questions.sweep.drives import Drives, time_axis
 from advsearch.questions.sweep.display import sweep_figure
+from advsearch.questions.sweep.drives import Drives, time_axis
 from advsearch.questions.sweep.job import KIND, Job, OpenScenes, check_all, check_worst
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.predicting import combined

@@ -17,8 +17,8 @@ import pandas as pd
 
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.trials import paired_by_unit, per_unit, share_interval
-from advsearch.options import OUT_OF_VIEW
 from advsearch.errors import FileFormatError
+from advsearch.options import OUT_OF_VIEW
 from advsearch.pictures import LARGEST_FILE, check_pixels, opened
 from advsearch.questions.sweep.display import sweep_axes, sweep_figure
 from advsearch.questions.sweep.job import KIND

@@ -34,10 +34,10 @@ from advsearch.runs.files import write_bytes
 from advsearch.runs.store import Row
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.description import OBJECT
+from advsearch.scene.formation import Surfaces
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.surface_parts import CELLS, SurfaceParts
-from advsearch.scene.formation import Surfaces
 
 Counts = npt.NDArray[np.int64]
 Doubles = npt.NDArray[np.float64]

@@ -20,12 +20,12 @@ from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, draws_needed
 from advsearch.config import SceneConfig
-from advsearch.options import OUT_OF_VIEW
 from advsearch.engine.journal import Journal, Shared, worker_call
 from advsearch.engine.problem import AWAY, Problem, as_claimed, changed
 from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
+from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress
 from advsearch.questions.attack.carry_out import executor_for, parts_of, problem_on
 from advsearch.questions.attack.settings import AttackConfig

@@ -11,11 +11,18 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Doubles, Ints
-from advsearch.scene.assets import srgb_to_linear
-from advsearch.scene.importing.files import MOST_CORNERS, Notes, References, is_number, numbers_in, shown, text_of
+from advsearch.scene.assets import Doubles, Ints, srgb_to_linear
+from advsearch.scene.importing.files import (
+    MOST_CORNERS,
+    SPLATS,
+    Notes,
+    References,
+    is_number,
+    numbers_in,
+    shown,
+    text_of,
+)
 from advsearch.scene.importing.geometry import cut_up
-from advsearch.scene.importing.files import SPLATS
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, alike, split_at_corners
 from advsearch.scene.importing.pictures import FilePictures
 

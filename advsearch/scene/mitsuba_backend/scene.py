@@ -20,7 +20,7 @@ from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import EVERYTHING, SAMPLER, next_count
+from advsearch.scene.formation import EVERYTHING, SAMPLER, Surfaces, next_count
 from advsearch.scene.grounds import enclosed
 from advsearch.scene.mitsuba_backend import parts
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, repeating, sampling_weights, textured_emission
@@ -28,7 +28,6 @@ from advsearch.scene.mitsuba_backend.transport import Paths, collect, first_hits
 from advsearch.scene.mitsuba_backend.variant import Plugin, Recordings, dr, mi, one_at_a_time, population
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
 from advsearch.scene.parts import PATTERN, Lamp, LampGlass, plugins_in
-from advsearch.scene.formation import Surfaces
 
 MAX_DEPTH = 6  # longest light path in segments: five bounces off surfaces
 NO_ROULETTE, ROULETTE = 1000, 2

@@ -23,8 +23,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.scene.mitsuba_backend.variant import dr, mi
 from advsearch.scene.formation import Surfaces
+from advsearch.scene.mitsuba_backend.variant import dr, mi
 
 STEP = 0.0625  # how much the base colour is changed for the derivative of a BSDF with respect to it
 ROUNDING = 1e-4  # relative change of a BSDF under which it counts as none

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch import threads
-from advsearch.scene.mitsuba_backend.variant import KEY, _buffers, _gain, denoise
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import KEY, _buffers, _gain, denoise, mitsuba
 
 SIZE = (72, 88)
 
