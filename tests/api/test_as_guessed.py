@@ -21,7 +21,7 @@ from PIL import Image
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.controls import LightControl, PoseControl
+from advsearch.controls import CONTROLS, LightControl, PoseControl
 from advsearch.engine.loading import as_controls, instances_in, settings_of
 from advsearch.engine.naming import given_to
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError
@@ -441,8 +441,9 @@ def test_names_that_people_guess_are_there(attacked: AttackResult) -> None:
     assert attacked.success is attacked.found
     assert attacked.images["clean"] is attacked.clean and attacked.images["adversarial"] is attacked.adversarial
     assert advsearch.losses.nps is advsearch.losses.non_printability
-    for base in (advsearch.Control, advsearch.Policy, advsearch.Task):
+    for base in (advsearch.Policy, advsearch.Task):
         assert inspect.isabstract(base), base
+    assert all(issubclass(kind, advsearch.Control) for kind in CONTROLS.values())
 
 
 def test_columns_have_plain_names_and_units_stand_beside_them(scene: advsearch.Scene, model: advsearch.Model) -> None:
