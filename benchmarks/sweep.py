@@ -40,8 +40,8 @@ from advsearch.questions.sweep.settings import SweepConfig  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
 from advsearch.scene.formation import EVERYTHING, ImageFormation  # noqa: E402
 from advsearch.scene.gradients import GradientPlan  # noqa: E402
+from advsearch.scene.mitsuba_backend.denoise import denoise  # noqa: E402
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene  # noqa: E402
-from advsearch.scene.mitsuba_backend.variant import denoise  # noqa: E402
 from advsearch.tasks import Classification  # noqa: E402
 
 ASKED_PER_SECOND, ASKED_SHARE = 10_000, 0.95

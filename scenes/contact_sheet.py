@@ -36,8 +36,9 @@ def picture(
     """Render an object on a brown ground plane; (size, size, 3) display-referred sRGB. Angles in degrees."""
     import torch
 
+    from advsearch.scene.mitsuba_backend.denoise import denoise
     from advsearch.scene.mitsuba_backend.meshes import mitsuba_mesh, principled
-    from advsearch.scene.mitsuba_backend.variant import denoise, mitsuba
+    from advsearch.scene.mitsuba_backend.variant import mitsuba
 
     mi = mitsuba()
     transform = mi.ScalarTransform4f

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.special import bdtr, betaincinv, ndtr, ndtri, stdtrit
-from scipy.stats import hypergeom
 from torch import Tensor
 
 from advsearch.attacks.evaluation import Evaluate, Query
@@ -540,6 +539,8 @@ def fewer_by_chance(
         return 1.0
     if (a + b).max() == 1.0:
         here, there, right, others = (round(times * float(counts.sum())) for counts in (k, a, r, b))
+        from scipy.stats import hypergeom  # late: a quarter of a second, and searches need none
+
         return float(hypergeom.cdf(here, there + others, here + right, there))
     if (np.minimum(a, b) == 0.0).all() and len(np.unique(a + b)) == 1:
         values, copies = np.unique(k + r, return_counts=True)

@@ -32,8 +32,8 @@ from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import ImageFormation, Later, Moment, Surfaces, levels_of
 from advsearch.scene.geometry import camera_to_world, middle
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_order, first_plan, steps_for
+from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.mitsuba_backend.variant import denoise
 from advsearch.scene.rig import Mount
 
 MAX_SPP = 65536

@@ -30,8 +30,8 @@ from advsearch import seeds
 from advsearch.files import scaled
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.assets import Floats, Ints
+from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.transport import Paths, Vertices, mean_of
-from advsearch.scene.mitsuba_backend.variant import denoise
 from advsearch.scene.parts import PATTERN
 from advsearch.scene.predictor import MOST_BYTES, LinearMap, Predictor
 from advsearch.scene.renderer import InputSpace, Renderer

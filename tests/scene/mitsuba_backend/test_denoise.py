@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from advsearch import threads
-from advsearch.scene.mitsuba_backend.variant import KEY, _buffers, _gain, denoise, mitsuba
+from advsearch.scene.mitsuba_backend.denoise import KEY, _buffers, _gain, denoise
+from advsearch.scene.mitsuba_backend.variant import mitsuba
 
 SIZE = (72, 88)
 
