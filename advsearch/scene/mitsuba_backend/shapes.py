@@ -107,8 +107,11 @@ def _solid(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
         normals = vertices * (1.0, 1.0, 0.0)
         low, high = (np.asarray(shape.get(end, (0.0, 0.0, z)), np.float64) for end, z in (("p0", 0.0), ("p1", 1.0)))
         length = float(np.linalg.norm(high - low))
-        along = (high - low) / max(length, 1e-30)
-        aside, across = (np.array(axis, np.float64)[:, 0] for axis in mi.coordinate_system(mi.Vector3f(along)))
+        x, y, z = along = (high - low) / max(length, 1e-30)
+        sign = np.copysign(1.0, z)
+        a = -1.0 / (sign + z)  # axes as of Mitsuba's `coordinate_system` (Duff et al. 2017), which has float32 alone
+        aside = np.array([1.0 + sign * x * x * a, sign * x * y * a, -sign * x])
+        across = np.array([x * y * a, sign + y * y * a, -y])
         local[:3] = np.stack([aside * radius, across * radius, along * length, low], axis=1)
     elif kind == "disk":
         uvs, faces = _grid(turn[::8], turn)
