@@ -159,7 +159,7 @@ def made(
         wanted = f"a width and a height from 1 to {MOST_PIXELS} pixels"
         raise FileFormatError(f"{path}: expected {wanted}, got {width:g} x {height:g}")
     if kind == EQUIRECTANGULAR:
-        found = {"fx": width, "fy": height, "cx": width / 2.0, "cy": height / 2.0}
+        found, first = {"fx": width, "fy": height, "cx": width / 2.0, "cy": height / 2.0}, 0.0
     value = {name: found.get(name, 0.0) for name in NUMBERS}
     value["cx"], value["cy"] = value["cx"] + first, value["cy"] + first
 

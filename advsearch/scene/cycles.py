@@ -145,7 +145,8 @@ class Cycles:
         self._process: _Process | None = None
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Render linear radiance (H, W, 3), as `MitsubaScene.radiance`. Raises BlenderError: Blender stopped."""
+        """Render linear radiance (H, W, 3), as `MitsubaScene.radiance`. Raises BlenderError: Blender stopped, or took
+        too long."""
         held = self._held
         same = held.keys() == inputs.keys() and all(torch.equal(held[name], inputs[name]) for name in inputs)
         if self._process is None or not same:

@@ -189,7 +189,7 @@ class CameraView(NamedTuple):
 def valid(environment: Surroundings, camera: CameraView) -> tuple[float, float]:
     """Return up to which horizontal distance from the object, and up to which height above the ground, an environment's
     picture fits a camera that looks as this one does (its own distance does not count): in the lengths of
-    `environment`, infinite without a bound, 0 where it fits nowhere. See the top of this file."""
+    `environment`, infinite without a bound, 0 where it fits nowhere. See above."""
     if abs((environment.turned + 180.0) % 360.0 - 180.0) > TURNED:
         return 0.0, 0.0
     behind = (FACTOR - 1.0) * _reach(environment.stands, camera.towards)

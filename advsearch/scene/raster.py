@@ -158,7 +158,8 @@ def texels_of_faces(mesh: Mesh, faces: Ints, shape: tuple[int, int]) -> tuple[Bo
 
 def rasterised(mesh: Mesh, resolution: int | tuple[int, int]) -> Charts:
     """Find the face and the barycentric weights behind every texel centre of a texture, square where its resolution is
-    one number. Where charts overlap, one of their faces wins. Raises InputError: they cover no texel."""
+    one number. Where charts overlap, one of their faces wins. Raises InputError: the texture
+    coordinates cover no texel."""
     shape = (resolution, resolution) if isinstance(resolution, int) else resolution
     corners = _in_texels(mesh, shape)
     face, row, column = pixels_near(corners, shape)

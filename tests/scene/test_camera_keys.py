@@ -193,6 +193,11 @@ def test_all_kinds_with_one_lens_are_one_lens(tmp_path: Path) -> None:
         assert found.kind == fisheye.kind == "fisheye" and found.numbers == pytest.approx(fisheye.numbers), kind
 
 
+def test_a_panorama_of_kalibr_looks_ahead_in_its_middle(tmp_path: Path) -> None:
+    found = read(tmp_path, {"cam0": KINDS["kalibr"]["cam0"] | {"distortion_model": "equirectangular"}})
+    assert found.kind == "equirectangular" and found.numbers[:5] == (1.0, 1.0, 0.5, 0.5, 0.0)
+
+
 def test_rectification_is_told_where_it_is_some(tmp_path: Path) -> None:
     turned = KINDS["ros"] | {"r": [0.8, 0.6, 0.0, -0.6, 0.8, 0.0, 0.0, 0.0, 1.0]}
     (told,) = read(tmp_path, turned).told

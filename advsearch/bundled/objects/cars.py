@@ -144,6 +144,10 @@ OPENINGS: dict[str, dict[str, str | None]] = {
 """What is carved out of the body and out of the cabin, and what it becomes."""
 
 
+def _opening(name: str) -> shapes.Field:
+    return lambda p: _inside(p)[name]
+
+
 def _body_and_cabin() -> list[Patch]:
     deck = [(1.0, s * 0.78, s * 1.79, s * -1.965) for s in (0.92, 0.81, 0.69, 0.56, 0.43)]
     roof = [(1.0, s * 0.5, MIDDLE + s * 0.28, MIDDLE - s * 0.8) for s in (0.75, 0.45, 0.15, 0.002)]
@@ -154,7 +158,7 @@ def _body_and_cabin() -> list[Patch]:
     }
     for part, openings in OPENINGS.items():
         for name, tag in openings.items():
-            parts[part] = shapes.carved(parts[part], lambda p, name=name: _inside(p)[name], tag)  # type: ignore[misc]
+            parts[part] = shapes.carved(parts[part], _opening(name), tag)
     return parts["body"] + parts["cabin"]
 
 

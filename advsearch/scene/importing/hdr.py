@@ -228,9 +228,11 @@ def _scanlines(path: Path, body: bytes, height: int, width: int) -> Bytes:
     result = np.empty((height, width, 4), np.uint8)
     position, mark = 0, bytes([2, 2, width >> 8 & 0xFF, width & 0xFF])
     for row in range(height):
-        encoded = 8 <= width < 32768 and body[position : position + 4] == mark
         try:
-            position = (_run_lengths if encoded else _plain_line)(body, position + 4 * encoded, result[row])
+            if 8 <= width < 32768 and body[position : position + 4] == mark:
+                position = _run_lengths(body, position + 4, result[row])
+            else:
+                position = _plain_line(body, position, result[row])
         except (IndexError, ValueError):
             got = f"{row} whole ones and the start of another; the file is cut short or damaged"
             raise damaged(path, f"{height} scanlines of {width} pixels", got) from None

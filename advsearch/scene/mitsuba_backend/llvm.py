@@ -131,7 +131,7 @@ def ensure_llvm() -> LibraryFile:
         version = asked_version(named)
         chosen = LibraryFile(path, version, refusal(version))
     elif path.is_file():
-        chosen = replace(examine(path.resolve(), name_hint=path), path=path)
+        chosen = examine(path.resolve(), name_hint=path)
     else:
         raise EnvironmentSetupError(
             f"{VARIABLE}: expected a libLLVM file, got {named!r}, which does not exist. {correct}"
@@ -140,7 +140,7 @@ def ensure_llvm() -> LibraryFile:
         raise EnvironmentSetupError(
             f"{VARIABLE}: expected a libLLVM of version {MINIMUM} or later, got {chosen}. {correct}"
         )
-    return chosen
+    return replace(chosen, path=path)
 
 
 def install_command(release: Mapping[str, str] | None = None, system: str = sys.platform) -> str:

@@ -232,7 +232,7 @@ def _haze(part: parts.HazePart) -> Translation:
     """Mitsuba's medium only holds density and albedo for the integrator: no shape refers to it."""
     name, albedo = part.name, _rgb(part.albedo)
     medium = mi.load_dict({"type": "homogeneous", "albedo": albedo, "sigma_t": part.density}, optimize=False)
-    population.add(population, media=(medium,))  # Mitsuba does not let go of it
+    population.add(population, media=(medium,))  # for good: Mitsuba does not let go of it
     inputs = (
         SceneInput(f"{name}.density", f"{name}.sigma_t.value.value", number, True, (1,)),
         SceneInput(f"{name}.albedo", f"{name}.albedo.value.value", color, True, (3,)),

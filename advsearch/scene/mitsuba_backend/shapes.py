@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -106,8 +107,11 @@ def _solid(kind: str, shape: Mapping[str, object], name: str) -> Buffers:
         normals = vertices * (1.0, 1.0, 0.0)
         low, high = (np.asarray(shape.get(end, (0.0, 0.0, z)), np.float64) for end, z in (("p0", 0.0), ("p1", 1.0)))
         length = float(np.linalg.norm(high - low))
-        along = (high - low) / max(length, 1e-30)
-        aside, across = (np.array(axis, np.float64)[:, 0] for axis in mi.coordinate_system(mi.Vector3f(along)))
+        x, y, z = along = (high - low) / max(length, 1e-30)
+        sign = np.copysign(1.0, z)
+        a = -1.0 / (sign + z)  # axes as of Mitsuba's `coordinate_system` (Duff et al. 2017), which has float32 alone
+        aside = np.array([1.0 + sign * x * x * a, sign * x * y * a, -sign * x])
+        across = np.array([x * y * a, sign + y * y * a, -y])
         local[:3] = np.stack([aside * radius, across * radius, along * length, low], axis=1)
     elif kind == "disk":
         uvs, faces = _grid(turn[::8], turn)
@@ -188,7 +192,7 @@ def _reference(plugin: object) -> str | None:
 def _numbers(value: object) -> Doubles:
     """Return a number (1,), or the three of a colour; NaN of anything else."""
     if isinstance(value, Mapping):
-        value = value.get("value") if value["type"] in ("rgb", "uniform", "spectrum", "srgb") else None
+        value = value.get("value") if value.get("type") in ("rgb", "uniform", "spectrum", "srgb") else None
     try:
         numbers = np.atleast_1d(np.asarray(None if isinstance(value, (str, bool)) else value, np.float64))
     except (TypeError, ValueError):  # such as pairs of wavelength and value
@@ -228,8 +232,12 @@ class ShapeSurface:
     notes: tuple[str, ...]  # clauses about what is not as in the scene
 
 
-Color = tuple[Floats, Plugin, object]
-"""A base colour: linear (H, W, 3), the entries that say how it is looked up, and a transform of its own or None."""
+class _Color(NamedTuple):
+    """A base colour."""
+
+    linear: Floats  # (H, W, 3)
+    options: Plugin  # how it is looked up
+    to_uv: object = None  # its own transform of texture coordinates
 
 
 def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
@@ -238,18 +246,18 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
     Whatever else is looked up by texture coordinates stays in its place: where the base colour has a transform of its
     own, the others get the inverse before theirs.
     """
-    base: Color | None = None
+    base: _Color | None = None
 
     def without(plugin: Mapping[str, object]) -> Plugin:
         nonlocal base
         key = COLORS.get(str(plugin["type"]))
         color = None if key is None or base is not None else _color(plugin.get(key, GREY))
         if key is not None and color is not None:
-            base, plugin = color, {**plugin, key: {"type": BASE_COLOR, **color[1]}}
+            base, plugin = color, {**plugin, key: {"type": BASE_COLOR, **color.options}}
         return with_inner(plugin, without)
 
     surface = without(bsdf)
-    linear, _, placed = base or (np.full((PLAIN_SIZE, PLAIN_SIZE, 3), GREY, np.float32), {}, None)
+    linear, _, placed = base or _Color(np.full((PLAIN_SIZE, PLAIN_SIZE, 3), GREY, np.float32), {})
     notes, plugins = [], list(plugins_in(surface))
     types = {str(plugin["type"]) for plugin in plugins}
     if BASE_COLOR not in types:
@@ -288,10 +296,10 @@ def uv_matrix(value: object) -> Doubles:
     return matrix if matrix.shape == (3, 3) else matrix[np.ix_((0, 1, 3), (0, 1, 3))]
 
 
-def _color(value: object) -> Color | None:
+def _color(value: object) -> _Color | None:
     plain = constant(value)
     if plain is not None:
-        return np.broadcast_to(plain, (PLAIN_SIZE, PLAIN_SIZE, 3)), {}, None
+        return _Color(np.broadcast_to(plain, (PLAIN_SIZE, PLAIN_SIZE, 3)), {})
     if not isinstance(value, Mapping):
         return None
     if value["type"] == "checkerboard":
@@ -300,13 +308,13 @@ def _color(value: object) -> Color | None:
         if dark is None or light is None or rest:
             return None
         board = np.array([[dark, light], [light, dark]], np.float32)
-        return _repeated(board), {"filter_type": "nearest"}, value.get("to_uv")
+        return _Color(_repeated(board), {"filter_type": "nearest"}, value.get("to_uv"))
     picture = _pixels(value) if value["type"] == "bitmap" else None
     if picture is None:
         return None
     options = {key: entry for key, entry in value.items() if key not in OF_THE_PICTURE}
     sharp = options.get("filter_type") == "nearest"
-    return _repeated(picture) if sharp else picture, options, value.get("to_uv")
+    return _Color(_repeated(picture) if sharp else picture, options, value.get("to_uv"))
 
 
 def _repeated(picture: Floats) -> Floats:

@@ -171,9 +171,9 @@ class Bounce:
 
 
 def _traced(scene: Any, ray: Any, weight: Any, noise: Any, depth: int) -> tuple[list[Any], list[Any], list[Bounce]]:
-    """Trace paths; return what the camera sees, channel by
-    channel as in `Paths`, and from the first vertex on what each emits and, but for the last, how
-    it reflects light. Rays of weight 0 see nothing."""
+    """Trace paths; return what the camera sees, channel by channel in the order of the pictures of `Paths` after the
+    radiance, and from the first vertex on what each emits and, but for the last, how it reflects light. Rays of weight
+    0 see nothing."""
     context, count, mis_weight = mi.BSDFContext(), dr.width(ray.o), mi.ad.integrators.common.mis_weight
     active = dr.any(weight > 0.0) & dr.full(mi.Bool, True, count)
     sharp = dr.full(mi.Bool, True, count)  # no vertex so far scatters light

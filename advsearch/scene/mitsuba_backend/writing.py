@@ -40,7 +40,7 @@ BAKED = ("filename", "to_world", "flip_tex_coords")  # entries of a mesh from a 
 def write_scene(
     scene: MitsubaScene, inputs: Mapping[str, Tensor], path: Path, note: str, *, hide: bool = False
 ) -> None:
-    """Write a scene with its inputs set, and the visible environment hidden or not, as of `MitsubaScene.radiance`, as
+    """Write a scene with its inputs set, and the visible environment hidden or not, as of `MitsubaScene.pictures`, as
     XML that stock Mitsuba loads, into a folder that is there, with meshes and pictures beside it, and a note as a
     comment.
 
