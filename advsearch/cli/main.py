@@ -80,7 +80,7 @@ class QuestionCommand:
     Attributes:
         name: of the command; `advsearch.config.CONFIGS` has its settings, and `question.carry_out` asks with them.
         text: makes a text for a person of its result; what is shown of it where it has no other.
-        short, about, expected, brought, listed, more, examples: as of `advsearch.question.question`; `--code` allows
+        short, about, expected, brought, listed, more, examples: as of `advsearch.question.Question`; `--code` allows
             Python code that the runs, or the file, which it is about name.
     """
 
