@@ -113,11 +113,11 @@ class Preprocessing:
     """
 
     input_size: tuple[int, int]  # (height, width) in pixels
-    mean: Triple = (0.0, 0.0, 0.0)
-    std: Triple = (1.0, 1.0, 1.0)
+    mean: Triple = (0.0, 0.0, 0.0)  # one number per channel
+    std: Triple = (1.0, 1.0, 1.0)  # likewise, over 0
     value_range: tuple[float, float] = (0.0, 1.0)  # (low, high) that black and white are sent to
-    layout: str = "NCHW"
-    channels: str = "RGB"
+    layout: str = "NCHW"  # or "NHWC"
+    channels: str = "RGB"  # or "BGR"
     processor: Callable[[Tensor], Tensor] | None = None
     resizes: bool = True
 
