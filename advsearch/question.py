@@ -112,18 +112,18 @@ class Question(Generic[AnyResult]):
     config: type[Config]
     result: type[AnyResult]
     examples: tuple[str, ...]  # lines of a shell, for its help
-    place: tuple[str, ...] = ()  # settings that Python takes by position
-    about: str = ""  # the setting that names a run or a file which it is about
+    place: tuple[str, ...]  # settings that Python takes by position
+    about: str  # the setting that names a run or a file which it is about
     # where that is given without its flag, what stands for it in the help, and what an error says it is; perhaps what
     # the help adds, and whether there may be several
-    expected: tuple[Any, ...] | None = None
+    expected: tuple[Any, ...] | None
     # returns settings that the `run.yaml` of that run brings, by what was typed
-    brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None
-    called: str = ""  # ``module:function`` that Python calls, where more can be given there than settings
-    more: str = ""  # what its help says after what it does
+    brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None
+    called: str  # ``module:function`` that Python calls, where more can be given there than settings
+    more: str  # what its help says after what it does
     # whether a result falls short of what was checked, which ends the command with status 3
-    short: Callable[[Any], bool] = lambda result: False
-    listed: str = ""  # ``module:function`` that returns what that setting may be, each with a line: `list` prints it
+    short: Callable[[Any], bool]
+    listed: str  # ``module:function`` that returns what that setting may be, each with a line: `list` prints it
 
     def from_config(
         self, config: Any, *, progress: Progress | None = None, resumed: Path | None = None, **more: Any
@@ -161,15 +161,27 @@ class Question(Generic[AnyResult]):
         return asks(self.config)(function)
 
 
-def question(*examples: str, **fields: Any) -> Callable[[Callable[..., AnyResult]], Question[AnyResult]]:
+def question(
+    *examples: str,
+    place: tuple[str, ...] = (),
+    about: str = "",
+    expected: tuple[Any, ...] | None = None,
+    brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None,
+    called: str = "",
+    more: str = "",
+    short: Callable[[Any], bool] = lambda result: False,
+    listed: str = "",
+) -> Callable[[Callable[..., AnyResult]], Question[AnyResult]]:
     """Make a `Question` of a function ``(asked: Asked[NameConfig]) -> NameResult`` that is called as its command, with
-    examples for its help and further fields of `Question` by their names."""
+    examples for its help; the others are fields of `Question`."""
 
     def decorate(function: Callable[..., AnyResult]) -> Question[AnyResult]:
         hints = get_type_hints(function)
         first, result = next(iter(inspect.signature(function).parameters)), hints["return"]
         (config,) = get_args(hints[first])
         result = (*get_args(result), result)[0]  # the first of several kinds
-        return Question(function, config, result, examples, **fields)
+        return Question(
+            function, config, result, examples, place, about, expected, brought, called, more, short, listed
+        )
 
     return decorate

@@ -32,7 +32,8 @@ FEWEST_ROWS = 100  # rows of which one half can choose and the other can count
 MOST_RULES = 5
 DEPTH = 3  # conditions of a rule, at most
 TREES = 24
-LEAST_SHARE, LEAST_ROWS, LEAST_UNITS = 0.01, 12, 3  # of the rows that choose, a rule covers so many, at least
+LEAST_SHARE, LEAST_ROWS, LEAST_UNITS = 0.01, 12, 3
+"""Of the rows that choose, a rule covers at least so many, and as many as so many units have."""
 KEPT = 0.97  # share of its weighted relative accuracy that a rule keeps when a condition is left out
 PASSES, BOUNDS = 3, 250  # how often all bounds of a rule are moved, and to how many places (quantiles) of their factor
 CHANCE = 0.01

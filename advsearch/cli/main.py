@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import methodcaller
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 
 from advsearch import __version__
 from advsearch.cli import output
@@ -64,6 +64,15 @@ def command(
     return lambda run: PlainCommand(run, arguments, more, examples)
 
 
+class Place(NamedTuple):
+    """How what a question is about is given without its flag, the fields of `expected`."""
+
+    metavar: str  # what the help calls it
+    missing: str  # what an error says where neither is given
+    more: str = ""  # what the help adds
+    several: bool = False
+
+
 @dataclass(frozen=True)
 class QuestionCommand:
     """A command that asks a question.
@@ -71,7 +80,7 @@ class QuestionCommand:
     Attributes:
         name: of the command; `advsearch.config.CONFIGS` has its settings, and `question.carry_out` asks with them.
         text: makes a text for a person of its result; what is shown of it where it has no other.
-        short, about, expected, brought, listed, more, examples: as of `advsearch.question.question`; `--code` allows
+        short, about, expected, brought, listed, more, examples: as of `advsearch.question.Question`; `--code` allows
             Python code that the runs, or the file, which it is about name.
     """
 
@@ -86,11 +95,9 @@ class QuestionCommand:
     examples: tuple[str, ...] = ()
 
     @property
-    def place(self) -> tuple[str, str, str, bool]:
-        """How what it is about is given without its flag: what the help calls it, what is missing where neither is
-        given, what the help says more of it, and whether there may be several; the first is empty for not at all."""
-        metavar, missing, more, several = (*(self.expected or ("", "")), "", False)[:4]
-        return metavar, missing, more, several
+    def place(self) -> Place | None:
+        """How what it is about is given without its flag; None for not at all."""
+        return Place(*self.expected) if self.expected else None
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         # late, so that --help answers at once
@@ -99,23 +106,22 @@ class QuestionCommand:
 
         add_settings(parser, CONFIGS[self.name])
         output.add_quiet_flags(parser)
-        metavar, _, more, several = self.place
-        if metavar:
-            many, text = "*" if several else "?", f"as `--{self.about}`{more}"
-            parser.add_argument(self.about, metavar=metavar, nargs=many, default=argparse.SUPPRESS, help=text)
+        if place := self.place:
+            many, text = "*" if place.several else "?", f"as `--{self.about}`{place.more}"
+            parser.add_argument(self.about, metavar=place.metavar, nargs=many, default=argparse.SUPPRESS, help=text)
         if self.about:
             output.add_code_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
         """Ask what the arguments say. Raises InputError where what it is about is missing."""
-        named, (metavar, missing, _, _) = getattr(args, self.about, None), self.place
+        named, place = getattr(args, self.about, None), self.place
         if self.listed and named == "list":
             lines = imported(self.listed)()
             listed = [{"name": name, "title": text} for name, text in lines.items()]
             return output.say(args.json, {f"{self.name}s": listed}, output.aligned([*lines.items()]))
-        if metavar and named in (None, []):
+        if place and named in (None, []):
             command = f"advsearch {self.name}"
-            raise InputError(f"{command}: expected {missing}; see {command} --help")
+            raise InputError(f"{command}: expected {place.missing}; see {command} --help")
         if isinstance(named, list):
             setattr(args, self.about, ",".join(named))
         return self.carry_out(self.config(args), as_json=args.json, quiet=args.quiet)
@@ -131,7 +137,7 @@ class QuestionCommand:
         config, brought = CONFIGS[self.name], dict[str, Any]()
         if self.brought and self.about in args:
             name = getattr(args, self.about)
-            name = next(iter(split_names(name)), name) if self.place[3] else name
+            name = next(iter(split_names(name)), name) if self.place and self.place.several else name
             brought = self.brought(find_run(name) / CONFIG, vars(args))
         elif self.brought and (missing := [s.flag for s in settings(config) if s.required and s.field not in args]):
             command, run = f"advsearch {self.name}", f"--{self.about.replace('_', '-')} RUN"

@@ -15,7 +15,6 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
-from operator import methodcaller
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TextIO, cast
 
@@ -115,12 +114,15 @@ def _screen(stream: Any, *, needed: bool) -> TextIO:
     return cast(TextIO, stream)
 
 
-add_flags = methodcaller("add_argument", "--json", action="store_true", help="print one JSON value on standard output")
-add_code_flag = methodcaller(
-    "add_argument", "--code", action="append", default=[], metavar="MODULE:NAME",
-    help="Python code that a file or a run names and that may be imported, as it stands there; may be repeated",
-)  # fmt: skip
-"""What adds flags to a parser: ``--json``; ``--code``, for commands that carry out the settings of a file."""
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json``."""
+    parser.add_argument("--json", action="store_true", help="print one JSON value on standard output")
+
+
+def add_code_flag(parser: argparse.ArgumentParser) -> None:
+    """Add ``--code``, for commands that carry out the settings of a file."""
+    text = "Python code that a file or a run names and that may be imported, as it stands there; may be repeated"
+    parser.add_argument("--code", action="append", default=[], metavar="MODULE:NAME", help=text)
 
 
 def add_quiet_flags(parser: argparse.ArgumentParser) -> None:

@@ -11,8 +11,9 @@ import pickle
 import re
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -234,14 +235,16 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
         signs = {sign for item in level if isinstance(item, str) for sign in item}
         if any(ord(sign) not in _WHITE and not sign.isprintable() for sign in signs):
             raise refused(archive.path, f"{name!r} has text with hidden characters")
-        inside = list[Any]()
+        new = dict[int, Any]()  # each once: a pickle may name one part any number of times
         for outer in level:
+            inside: Iterable[Any] = ()
             if isinstance(outer, dict):
-                inside += [*outer, *outer.values()]
+                inside = chain(outer, outer.values())
             elif isinstance(outer, (list, tuple, _Inert)):
-                inside += outer.parts if isinstance(outer, _Inert) else outer
-        level = [inner for inner in inside if id(inner) not in seen]
-        seen.update(map(id, level))
+                inside = outer.parts if isinstance(outer, _Inert) else outer
+            new |= {id(inner): inner for inner in inside if id(inner) not in seen}
+        level = list(new.values())
+        seen.update(new)
         if not level:
             return
     raise refused(archive.path, f"{name!r} is nested deeper than {DEPTH}")

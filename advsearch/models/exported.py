@@ -78,15 +78,18 @@ def _check(node: ast.expr, depth: int, power: int) -> None:
                 raise ValueError(f"the name {name[:40]!r}")
         case ast.Call(func=ast.Name(id="Symbol" | "Float" as name), args=arguments, keywords=words):
             text = arguments[0].value if len(arguments) == 1 and isinstance(arguments[0], ast.Constant) else None
-            options = {word.arg: word.value.value if isinstance(word.value, ast.Constant) else None for word in words}
+            keys = {word.arg for word in words}
+            values = [
+                word.value.value if isinstance(word.value, ast.Constant) else None for word in words
+            ]  # repeated keys too
             if name == "Symbol":  # Symbol('s0', positive=True, integer=True)
-                assumed = None not in options and all(isinstance(value, bool) for value in options.values())
+                assumed = None not in keys and all(isinstance(value, bool) for value in values)
                 if not (isinstance(text, str) and is_symbol(text) and assumed):
                     raise ValueError("a symbol of another form")
             elif not (isinstance(text, str) and _DECIMAL.fullmatch(text)):  # Float('0.5', precision=53)
                 raise ValueError("a number of another form")
-            elif not options.keys() <= {"precision", "prec", "dps"} or not all(
-                isinstance(value, int) and 0 < value <= 200 for value in options.values()
+            elif not keys <= {"precision", "prec", "dps"} or not all(
+                isinstance(value, int) and 0 < value <= 200 for value in values
             ):
                 raise ValueError("a number of another precision")
         case ast.Call(keywords=[_, *_]):

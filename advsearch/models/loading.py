@@ -218,7 +218,7 @@ def _preprocessing(source: Source, given: Mapping[str, object]) -> Preprocessing
             numbers = _numbers(key, value, (1, 3), f"one number, three numbers, or one of {', '.join(PRESETS)}")
             fields[key] = (numbers[0], numbers[len(numbers) // 2], numbers[-1])
     if any(number <= 0 for number in fields["std"] or ()):
-        raise InputError(f"std: expected numbers greater than 0, got {given.get('std')!r}")
+        raise InputError(f"std: expected numbers greater than 0, got {given.get('std', fields['std'])!r}")
     if "value_range" in given:
         expected = "two numbers (low, high), such as (0, 255)"
         low, high = _numbers("value_range", given["value_range"], (2,), expected)

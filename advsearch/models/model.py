@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
-from torch.utils._pytree import tree_flatten, tree_leaves, tree_map_only, tree_unflatten
+from torch.utils._pytree import tree_flatten, tree_unflatten
 
 from advsearch.errors import InputError, ModelError
 from advsearch.interrupts import INTERRUPTS
@@ -113,11 +113,11 @@ class Preprocessing:
     """
 
     input_size: tuple[int, int]  # (height, width) in pixels
-    mean: Triple = (0.0, 0.0, 0.0)
-    std: Triple = (1.0, 1.0, 1.0)
+    mean: Triple = (0.0, 0.0, 0.0)  # one number per channel
+    std: Triple = (1.0, 1.0, 1.0)  # likewise, over 0
     value_range: tuple[float, float] = (0.0, 1.0)  # (low, high) that black and white are sent to
-    layout: str = "NCHW"
-    channels: str = "RGB"
+    layout: str = "NCHW"  # or "NHWC"
+    channels: str = "RGB"  # or "BGR"
     processor: Callable[[Tensor], Tensor] | None = None
     resizes: bool = True
 
@@ -220,7 +220,7 @@ class Model:
             return moved.clone() if moved is output and not output.requires_grad else moved
 
         def asked(part: Tensor) -> Any:
-            return tree_map_only(Tensor, kept, self.ask(self.prepared(part))[: len(part)])
+            return each_tensor(self.ask(self.prepared(part))[: len(part)], kept)
 
         parts = [recomputed(asked, part) if again else asked(part) for part in images.split(most)]
         output = parts[0] if len(parts) == 1 else joined(parts)
@@ -325,9 +325,28 @@ def joined(parts: Sequence[Any]) -> Any:
     return torch.cat(list(parts)) if isinstance(parts[0], Tensor) else list(chain.from_iterable(parts))
 
 
+def each_tensor(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
+    """Return an output with a function of every tensor in it in that one's place, in plain dicts and lists: torch's
+    trees end at kinds of these that nobody has told it, such as a library's outputs."""
+    if isinstance(output, Tensor):
+        return function(output)
+    if isinstance(output, Mapping):
+        return {name: each_tensor(part, function) for name, part in output.items()}
+    if isinstance(output, (list, tuple)):
+        return [each_tensor(part, function) for part in output]
+    return output
+
+
 def tensors_in(output: Any) -> list[Tensor]:
     """Return the tensors in an output, in their order."""
-    return [part for part in tree_leaves(output) if isinstance(part, Tensor)]
+    found: list[Tensor] = []
+
+    def keep(tensor: Tensor) -> Tensor:
+        found.append(tensor)
+        return tensor
+
+    each_tensor(output, keep)
+    return found
 
 
 def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor:

@@ -123,8 +123,10 @@ def _run(model: Model, images: Tensor) -> Tensor:
         return logits_of(*_returned(model, images), None, model.name)[: len(images)].cpu()
     rows = []
     for output in _read(model, images):
-        values = torch.cat([torch.zeros(0), *(tensor.float().flatten().cpu() for tensor in tensors_in(output))])
-        rows.append(torch.stack([torch.tensor(float(len(values))), values.sum(), values.abs().sum()]))
+        values = torch.cat(
+            [torch.zeros(0, device="cpu"), *(tensor.float().flatten().cpu() for tensor in tensors_in(output))]
+        )
+        rows.append(torch.stack([torch.tensor(float(len(values))).to(values), values.sum(), values.abs().sum()]))
     return torch.stack(rows)
 
 

@@ -61,18 +61,36 @@ class Setting:
         return f"{self.description}: {self.expects}{unit}" + (f" (default: {default})" if default else "")
 
 
-def setting(default: Any, group: str, description: str, expects: str = "", **more: Any) -> Any:
-    """Return a pydantic field: `more` are the others of `Setting` by name, and constraints of `pydantic.Field`."""
-    constraints = {name: more.pop(name) for name in ("alias", "ge", "gt", "le", "min_length") if name in more}
-    extra: Any = {"declared": Setting(default, group, description, expects, **more), "constraints": constraints}
+def setting(
+    default: Any,
+    group: str,
+    description: str,
+    expects: str = "",
+    *,
+    unit: str = "",
+    otherwise: str = "",
+    flag: str = "",
+    metavar: str = "",
+    form: Form = "text",
+    switched: str = "",
+    power: Power = none,
+    **constraints: Any,
+) -> Any:
+    """Return a pydantic field: of a `Setting`, with constraints of `pydantic.Field`."""
+    declared = Setting(default, group, description, expects, unit, otherwise, flag, metavar, form, switched, power)
+    extra: Any = {"declared": declared, "constraints": constraints}
     make = {"default_factory": default} if callable(default) else {"default": default}
     return Field(**make, description=description, json_schema_extra=extra, **constraints)
+
+
+WORKED_OUT = ("field", "name", "required")  # of a `Setting`, by `settings`
 
 
 def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
     """Return a setting as another command declares it, but for some of the arguments of `setting`."""
     extra: Any = config.model_fields[field].json_schema_extra
-    return setting(**{**vars(extra["declared"]), **extra["constraints"], **changes})
+    declared = {name: value for name, value in vars(extra["declared"]).items() if name not in WORKED_OUT}
+    return setting(**{**declared, **extra["constraints"], **changes})
 
 
 class Clash(NamedTuple):

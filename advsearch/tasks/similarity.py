@@ -218,7 +218,7 @@ class Similarity(Classification):
 
     def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Similarity:
         """See `Task.on`; references are read and shown to the model, once. Raises InputError, FileFormatError: as for
-        `gallery.embedded`; neither references nor a threshold."""
+        `embedded`; neither references nor a threshold."""
         if not self.references and self.threshold is None:
             raise InputError(
                 "task similarity: references: expected a folder with a folder of pictures for each name, or a "

@@ -379,7 +379,8 @@ class Rig(Joined):
     def _each(self, value: str, output: Sequence[Outputs], truth: Truths) -> Tensor:
         """A number of each picture, (N, K)."""
         of_picture: Callable[[Any, Truth], Tensor] = getattr(self.part, value)
-        return torch.stack([torch.cat(list(map(of_picture, pictures, truth))) for pictures in output])
+        each = [[of_picture(*judged) for judged in zip(pictures, truth, strict=True)] for pictures in output]
+        return torch.stack([torch.cat(values) for values in each])
 
     def _ruled(self, wrong: Tensor) -> Tensor:
         """How wrong the rig is, (N,), from how wrong it is in each picture, (N, K)."""

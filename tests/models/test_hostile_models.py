@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import json
 import os
 import subprocess
@@ -19,6 +20,7 @@ from torch import Tensor, nn
 
 from advsearch import load_model
 from advsearch.errors import FileFormatError
+from advsearch.models import archive
 from advsearch.models import exported as reader
 
 Program = dict[str, Any]
@@ -307,6 +309,8 @@ def test_expressions_of_sizes_that_are_read(text: str) -> None:
         "sympify('1')",
         "Symbol(__import__('os'))",
         "Symbol('s0', **{'a': True})",
+        "Symbol('s0', positive=__import__('os').system('true'), positive=True)",
+        "Float('1', precision=10**9, precision=53)",
         "Symbol('os.system')",
         "Float('1e999999999')",
         "Float('1', precision=10**9)",
@@ -506,6 +510,14 @@ def test_nested_pickles_of_torchscript_are_refused(script: Path, tmp_path: Path)
     deep = b"\x80\x02(" + b"]" * 300_000 + b"a" * 299_999 + b"t."
     with pytest.raises(FileFormatError, match=r"'constants.pkl' is nested deeper than 200"):
         load_model(repacked(script, tmp_path / "net.pt", {"constants.pkl": deep}), input_size=8)
+
+
+def test_a_part_that_a_pickle_names_many_times_is_looked_at_once() -> None:
+    wide: list[Any] = []
+    for _ in range(30):
+        wide = [wide] * 9  # in all 9**30 parts, if each is counted as often as it stands there
+    with zipfile.ZipFile(io.BytesIO(), "w") as empty:
+        archive._check_values(archive.Archive(Path("net.pt"), empty, {}), "constants.pkl", wide)
 
 
 def test_pickles_of_torchscript_make_nothing(script: Path, tmp_path: Path) -> None:

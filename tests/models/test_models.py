@@ -708,6 +708,27 @@ def test_safetensors_alone_are_not_a_model(tmp_path: Path) -> None:
         load_model(tmp_path / "tiny.safetensors")
 
 
+class _Boxes(dict[str, Tensor]):
+    """What a library returns: a kind of dict that torch's trees do not know."""
+
+
+class _Overwrites(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.memory = torch.zeros(1)
+
+    def forward(self, x: Tensor) -> list[_Boxes]:
+        self.memory.fill_(float(x.mean()))
+        return [_Boxes(mean=self.memory) for _ in x]
+
+
+def test_an_output_in_a_librarys_own_kind_of_dict_does_not_change_later() -> None:
+    model = Model(_Overwrites(), "overwrites", (), Preprocessing((8, 8)), read=lambda answer, count: answer)
+    dark = model(torch.zeros(8, 8, 3))
+    model(torch.ones(8, 8, 3))
+    assert float(dark[0]["mean"]) == 0.0
+
+
 def test_unknown_names() -> None:
     with pytest.raises(UnknownNameError, match=r"unknown model 'referense'. Did you mean 'reference'"):
         load_model("referense")
