@@ -451,7 +451,7 @@ def moved(here: Floats, below: Floats) -> float:
 #
 # So K exceeds 2 / a with a probability of a / 2 at most (Markov), whatever units are like and however few there are,
 # also where each has a share of its own (the product's mean is at most 1, by the inequality of the means). These are
-# the bets of `trials.ConfidenceSequence`, whose stakes they take. Where each unit has one prediction, the exact tests
+# the bets of `ConfidenceSequence`, whose stakes they take. Where each unit has one prediction, the exact tests
 # of independent ones are taken, which are sharper: Clopper and Pearson, Newcombe, McNemar.
 
 Numbers = npt.NDArray[np.float64]
@@ -538,6 +538,8 @@ def fewer_by_chance(
     if not a.any() or not b.any():
         return 1.0
     if (a + b).max() == 1.0:
+        from scipy.stats import hypergeom  # takes half a second, and a search needs none of it
+
         here, there, right, others = (round(times * float(counts.sum())) for counts in (k, a, r, b))
         from scipy.stats import hypergeom  # late: a quarter of a second, and searches need none
 

@@ -65,6 +65,10 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     control = CONTROLS[kind]
     if parameter is not None:
         options.setdefault(parameter, _default_range(control, parameter))
+    known = [choice.name for choice in control.choices] + [known.name for known in control.declared(options)]
+    for setting in options:  # "name" is none that can be given
+        if setting not in known:
+            raise UnknownNameError(f"setting of control {kind}", setting, known)
     if name != kind:
         options["name"] = name
     return control(**options)

@@ -348,7 +348,8 @@ class Control:
         self.groups = tuple(self._group(slot) for slot in slots if slot.width)
         ranges = [slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0) for slot in slots]
         ends = torch.tensor([(spec.low, spec.high - spec.low) for spec in ranges], dtype=torch.float64).reshape(-1, 2)
-        self._low, self._span = ends.T.repeat_interleave(torch.tensor([slot.width for slot in slots]), dim=1)
+        widths = torch.tensor([slot.width for slot in slots], dtype=torch.long)
+        self._low, self._span = ends.T.repeat_interleave(widths, dim=1)
 
     def in_scene(self, parameter: Parameter) -> Parameter:
         """Return a parameter as this scene has it: with its value in the unchanged scene as the default, the range that

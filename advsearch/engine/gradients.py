@@ -324,6 +324,15 @@ class Bench:
             repeats: gradients by an estimator at first, and by one with another step, which has to be surer.
             stage: is told what begins and of how many steps.
         """
+
+        # what is kept has names, so that a run that an older version began goes on
+        def referred(probe: Probe, spp: int) -> dict[str, Any]:
+            bench = replace(self, spp=spp)
+            return bench.reference(probe, repeats=seeds_of_reference, factors=reference_factors)._asdict()
+
+        def estimated(estimator: str, along: Sequence[Probe], count: int, factor: float) -> list[dict[str, Any]]:
+            return [estimate._asdict() for estimate in self.estimates(estimator, along, count, factor)]
+
         for control, probes in groupby(self.probes(), lambda probe: probe.group.control):
             mine = list(probes)
             stage(f"references for {control}", len(mine))
@@ -331,9 +340,8 @@ class Bench:
             for probe in mine:
                 # what acts on the picture clips: its mean depends on the noise, so both get the same
                 many = self.spp if probe.group.estimator == "image" else max(self.spp, reference_spp)
-                measure = partial(replace(self, spp=many).reference, probe, repeats=seeds_of_reference)
-                kept = self.keep(f"reference {probe.name}", partial(measure, factors=reference_factors))
-                references[probe.name] = Reference(*kept)
+                kept = self.keep(f"reference {probe.name}", partial(referred, probe, many))
+                references[probe.name] = Reference(**kept)
                 self.tick(self.spp)
             sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}  # each comes from one gradient
             for probe in mine:
@@ -347,10 +355,10 @@ class Bench:
                         break
                     count = repeats[0] if factor == 1.0 else repeats[1]
                     name = f"{estimator} x {factor:g} {','.join(probe.name for probe in wanted)}"
-                    estimates = self.keep(name, partial(self.estimates, estimator, wanted, count, factor))
+                    estimates = self.keep(name, partial(estimated, estimator, wanted, count, factor))
                     for probe, estimate in zip(wanted, estimates, strict=True):
                         others = list(references.values())
-                        row = agreement(Estimate(*estimate), references[probe.name], others, probe, self.spp)
+                        row = agreement(Estimate(**estimate), references[probe.name], others, probe, self.spp)
                         good |= {probe.name} if row.status == "ok" else set()
                         yield row
                     self.tick(self.spp)

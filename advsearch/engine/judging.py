@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
-from itertools import product
 from operator import attrgetter
 from types import MappingProxyType
 from typing import Any, Literal
@@ -146,8 +145,10 @@ def measured(judgement: Judgement, metrics: Metrics, image: Tensor, output: Outp
     with torch.no_grad():
         for name, metric in metrics.items():
             value = metric(*copied((image.detach(), seen, right)))
-            several = value if isinstance(value, Mapping) else {}
-            returned |= {f"{name}.{key}": each for key, each in several.items()} if several is value else {name: value}
+            if isinstance(value, Mapping):
+                returned |= {f"{name}.{key}": each for key, each in value.items()}
+            else:
+                returned[name] = value
         for name, value in returned.items():
             try:
                 number = float(value)
@@ -233,17 +234,22 @@ def one_label_for_several(models: Sequence[Model], label: str | None, objects: M
     if label is None or len(objects) < 2:
         return []
 
-    others = dict[str, str]()
-    for (name, own), model in product(objects.items(), models):
-        known = set[int]()
-        with suppress(InputError):  # where no class is called so
-            known |= set(model.label_set(own).indices if own else ())
-        if known and not known & set(model.label_set(label).indices):
-            others[name] = f"{name} (its own is {own!r})"
+    def differ(own: str) -> bool:
+        """Whether a model has classes for both labels, and none in common."""
+        for model in models:
+            try:
+                known = set(model.label_set(own).indices)
+            except InputError:
+                continue
+            if not known & set(model.label_set(label).indices):
+                return True
+        return False
+
+    others = [f"{name} (its own is {own!r})" for name, own in objects.items() if own and differ(own)]
     if not others:
         return []
     return [
-        f"The label {label!r} is taken as the right label for every object, also for {', '.join(others.values())}; "
+        f"The label {label!r} is taken as the right label for every object, also for {', '.join(others)}; "
         "without a label, each object has its own."
     ]
 

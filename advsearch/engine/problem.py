@@ -209,7 +209,7 @@ class Problem:
     steps: int = 0  # renders of a search
     draws: int = 1  # conditions that one evaluation looks at, where there are any; the objective is their mean
     search_depth: int | None = None  # longest light path in segments of a search's renders; None for the scene's
-    aovs: tuple[str, ...] = ()  # layers of ground truth that are kept of clean and adversarial scene (`surfaces.AOVS`)
+    aovs: tuple[str, ...] = ()  # layers of ground truth that are kept of clean and adversarial scene (`formation.AOVS`)
     metrics: Metrics = field(default_factory=dict)  # numbers of every picture beside what the task says
     domain: Domain = field(init=False)  # where a search may look: the searched controls
     conditions: Domain | None = field(init=False)  # where the others are drawn from; None where there are none
@@ -508,8 +508,8 @@ class Problem:
             if values.requires_grad:
                 derivative = torch.autograd.grad((values * hard_first(values)).sum(), at)[0]
         evaluations = []
-        judgements = self._judged(outputs, pictures, truths, wholes)
-        for value, judgement, output in zip(values.detach(), judgements, each, strict=True):
+        judged = self._judged(outputs, pictures, truths, wholes)
+        for value, judgement, output in zip(values.detach(), judged, each, strict=True):
             evaluations.append((Evaluation(float(value), None, judgement.success, judgement=judgement), output))
         return evaluations, derivative
 

@@ -65,11 +65,12 @@ def as_record(row: Row) -> JsonObject:
 def each_value(values: Mapping[str, Value | JsonValue]) -> Iterator[tuple[str, JsonValue, str]]:
     """Yield values by name with their units; of several numbers each, as ``camera.target[0]``."""
     for name, told in values.items():
-        value, unit = (told.get("value"), told.get("unit", "")) if isinstance(told, Mapping) else (told, "")
+        value, unit = (told.get("value"), told.get("unit")) if isinstance(told, Mapping) else (told, None)
+        unit = str(unit or "")
         if isinstance(value, (list, tuple)):
-            yield from ((f"{name}[{number}]", inner, str(unit)) for number, inner in enumerate(value))
+            yield from ((f"{name}[{number}]", inner, unit) for number, inner in enumerate(value))
         else:
-            yield name, value, str(unit)
+            yield name, value, unit
 
 
 def _values(values: Mapping[str, Value | JsonValue]) -> JsonObject:

@@ -148,10 +148,11 @@ def _cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
     said = row.id or number, row.step, row.correct, row.margin, row.probability, row.seconds
     label = row.label or ("" if row.correct is None else NOT_A_NUMBER)
     cells: dict[str, Any] = dict(zip(SAID, (*said, label), strict=True))
-    for name, value, unit in each_value(row.values):
-        called = f"parameter {name}" if name.partition("[")[0] in TAKEN else name
-        units.setdefault(called, unit)
-        cells[called] = sys.intern(value) if isinstance(value, str) else value
+    for name, described in row.values.items():
+        called = f"parameter {name}" if name in TAKEN else name
+        for place, value, unit in each_value({called: described}):
+            units.setdefault(place, unit)
+            cells[place] = sys.intern(value) if isinstance(value, str) else value
     return cells
 
 

@@ -158,6 +158,9 @@ def test_names_and_settings_that_do_not_exist_are_explained() -> None:
         UnknownNameError, match=r"unknown setting of control texture 'epsilonn'. Did you mean 'epsilon'"
     ):
         make_control("texture", {"epsilonn": 0.1})
+    for setting in ("name", "self"):  # of Python's own
+        with pytest.raises(UnknownNameError, match=f"unknown setting of control light '{setting}'"):
+            make_control("light", {setting: "x"})
     with pytest.raises(InputError, match="controls: every instance needs a name of its own"):
         make_space([TextureControl(), TextureControl()], describe("mug"))
     with pytest.raises(InputError, match=r"controls: two controls set object.base_color"):
