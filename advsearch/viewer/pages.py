@@ -103,7 +103,8 @@ def end_html(run: Path, result: Result, given: ShownResult) -> Html:
     commands = [shlex.join(["advsearch", "run", str(recipe)])] if recipe.is_file() and is_command(command_line) else []
     commands += [command_line] if command_line else []
     parts += [element("h2", "Do it again"), *(element("pre", command, class_="wrap") for command in commands)]
-    if settings := recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else "":
+    settings = recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else ""
+    if settings:
         whole = element("pre", settings, class_="wrap")
         parts.append(element("details", element("summary", "All settings"), whole))
     return join_html(*parts)

@@ -70,8 +70,8 @@ def list_page(runs: Mapping[str, Path]) -> str:
         picture = element("img", src=f"{place}cover", alt="", loading="lazy", width="72", height="72")
         linked = element("a", None if run.fault else picture, href=place, tabindex="-1", aria_hidden="true")
         about = ", ".join(filter(None, (run.command, wording.short_names(run.object), " and ".join(run.controls))))
-        photos = element("a", "photographs", href=f"{place}align/", aria_label=f"photographs of {name}")
-        beside = join_html(" ", photos) if run.command in ("attack", "sweep") else None
+        aligning = element("a", "photographs", href=f"{place}align/", aria_label=f"photographs of {name}")
+        beside = join_html(" ", aligning) if run.command in ("attack", "sweep") else None
         came_out = join_html(run.state, f": {run.answer}" if run.answer else None)
         fault = element("div", run.fault, class_="remarks") if run.fault else None
         begun = "" if run.when is None else time.strftime("%Y-%m-%d %H:%M", time.localtime(run.when))

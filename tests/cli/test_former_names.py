@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from samples import make_run, written_page
 
 import advsearch
 from advsearch.cli.flags import add_settings, config_from
@@ -53,6 +54,14 @@ def test_the_configuration_of_an_older_run_is_read(tmp_path: Path) -> None:
     assert read_configuration(tmp_path).tolist() == point.tolist()
     write_configuration(tmp_path, 1.0 - point)
     assert read_configuration(tmp_path).tolist() == (1.0 - point).tolist()
+
+
+def test_the_page_of_an_older_run_shows_its_marked_pictures(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", rows=False)
+    for name in ("clean", "adversarial", "verification-00"):
+        (run / "images" / f"{name}-answer.png").write_bytes((run / "images" / f"{name}.png").read_bytes())
+    page = written_page(run).read_text()
+    assert "What it predicts" in page and "trial 00" in page and "trial 01" not in page
 
 
 def test_a_task_with_parts_by_their_former_names_is_told_those_of_now() -> None:

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import small_models
 
@@ -39,9 +40,13 @@ def test_they_are_told_and_not_counted(tmp_path: Path) -> None:
     """Shifted far to the side, the mug is out of view, which a detector cannot get wrong."""
     found = advsearch.sweep(
         "mug", small_models.finds_cars(), {"pose.y": [0.0, 60.0], "camera.distance": [0.3, 0.5]}, task="detection",
-        label="car", spp=1, denoise="none", trials=0, run=tmp_path / "run", keep_pictures="none",
+        label="car", spp=1, denoise="none", trials=0, run=tmp_path / "run", keep_pictures="none", surface=True,
+        must_not_change="exposure",
     ).summary  # fmt: skip
     assert (found.planned, found.configurations, found.out_of_view, found.looked_at) == (4, 2, 2, 4)
+    assert [one.configurations for one in found.changes or ()] == [2]
+    with np.load(tmp_path / "run" / "artifacts" / "surface.npz") as counts:
+        assert counts["pictures_0"].tolist() == [2] and counts["failures_0"].tolist() == [2 - found.correct]
     assert found.interval == pytest.approx(clopper_pearson(found.correct, 2))
     assert any("In 2 of 4 pictures nothing of the object is to be seen" in one for one in found.warnings)
     assert {one.value: one.total for one in conditions_of(found)} == {"0.3": 1, "0.5": 1, "0": 2}

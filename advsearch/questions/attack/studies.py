@@ -193,7 +193,10 @@ class StudyRun:
         budget = f", epsilon {config.epsilon:.3g}" if isinstance(config.epsilon, float) else ""
         what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
         self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
-        ask = lambda there, **more: attacking.attack_once(there, clean=clean, **more).summary  # noqa: E731
+
+        def ask(there: AttackConfig, **more: Any) -> AttackSummary:
+            return attacking.attack_once(there, clean=clean, **more).summary
+
         summary = carry_out_part(path, config, self.progress, ask)
         if not isinstance(summary, AttackSummary):
             raise FileFormatError(f"{path}: expected the run of an attack, got one of {summary.command}")

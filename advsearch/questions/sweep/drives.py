@@ -1,6 +1,6 @@
 """Drives: what a sweep over the frames of a path says of whole drives, everything that varies but the time, and the
 worst of them. Frames are not independent, so intervals are over drives, and hold for any number of them: each number
-has ends that it cannot pass (`attacks.units`)."""
+has ends that it cannot pass (`attacks.trials`)."""
 
 from __future__ import annotations
 

@@ -20,6 +20,7 @@ from advsearch.engine.journal import Journal, Sent, Shared, finite, lost, other_
 from advsearch.engine.loading import framed
 from advsearch.engine.record import LOST, Stages, judgement_of, lost_remarks
 from advsearch.interrupts import interruptible
+from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress
 from advsearch.questions.attack.result import save_marked
 from advsearch.questions.sweep import summary as results
@@ -323,7 +324,9 @@ class Sweep:
     def _changes(self) -> list[results.ChangeRates]:
         rates: list[results.ChangeRates] = []
         for claim, when in self.job.config.claims:
-            held = {row.step: row.metrics[name] for row in self.rows() if (name := f"{claim} {when}") in row.metrics}
+            name = f"{claim} {when}"
+            shown = (row for row in self.rows() if row.label != OUT_OF_VIEW)
+            held = {row.step: row.metrics[name] for row in shown if name in row.metrics}
             for model, network in enumerate(self.job.models):
                 numbers = np.array([one for one in held if one % self.models == model], dtype=np.int64)
                 right = np.array([held[one] == 1.0 for one in numbers.tolist()], dtype=bool)

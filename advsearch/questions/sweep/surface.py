@@ -23,6 +23,7 @@ from advsearch.attacks.domain import batches
 from advsearch.attacks.trials import wilson
 from advsearch.engine.loading import framed, load_scene
 from advsearch.engine.record import judgement_of
+from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import Progress
 from advsearch.questions.sweep.job import OpenScenes
 from advsearch.questions.sweep.result import rate
@@ -126,7 +127,7 @@ FILE = "artifacts/surface.npz"
 SIDES = ((0.0, 20.0), (90.0, 20.0), (180.0, 20.0), (270.0, 20.0), (0.0, 80.0), (0.0, -60.0))
 """Azimuth and elevation of the cameras that show the object in colours, degrees."""
 SIDE_PIXELS = 240
-UNKNOWN = -1  # stands for the prediction of a picture of which there is no row
+UNKNOWN = -1  # stands for the prediction of a picture of which there is no row, or that has nothing of the object
 AT_ONCE = 16  # pictures whose places are worked out at once
 
 
@@ -196,7 +197,8 @@ def map_surface(scenes: OpenScenes, rows: Iterable[Row], run: RunDirectory, prog
     per_scene, models = points.count, len(job.models)
     wrong: npt.NDArray[np.int8] = np.full((len(job.places), per_scene, models), UNKNOWN, np.int8)
     for row in rows:
-        wrong.flat[row.step] = not judgement_of(row).right
+        if row.label != OUT_OF_VIEW:  # nor is it hidden in a picture that has nothing of the object
+            wrong.flat[row.step] = not judgement_of(row).right
     draws = np.asarray(points.units.draw(np.arange(wrong[..., 0].size))).reshape(wrong.shape[:2])
     assets = {place.object: place.scene.description.object for place in job.places}
     counts = dict[str, SurfaceCounts]()
@@ -276,9 +278,14 @@ UNTOLD, UNCOMPARED, NOTHING = (0.78, 0.78, 0.78), (0.45, 0.45, 0.45), (1.0, 1.0,
 """Grey where a part is not told from chance, darker where too few pictures show it or do not; white beside charts."""
 ROWS = 2  # rows of the views of an object
 
-View = tuple[str, Counts, Doubles]
-"""What a camera sees of an object: where it stands; the number of the cell in each pixel (H, W), -1 beside the object;
-and how bright that is (H, W)."""
+
+class View(NamedTuple):
+    """What a camera sees of an object: where it stands, as text; the number of the cell in each pixel (H, W), row by
+    row of the map, -1 beside the object; and how bright that is (H, W)."""
+
+    title: str
+    cells: Counts
+    shade: Doubles
 
 
 class Panel(NamedTuple):
@@ -301,7 +308,7 @@ def _views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[View]:
         cells = np.full(there.shape, -1, np.int64)
         cells[there] = parts.cells(shown.face.numpy()[there], shown.uv.numpy()[there].astype(np.float64))
         shade = 0.7 + 0.3 * np.clip(shown.normal.numpy() @ np.array(LIGHT), 0.0, 1.0)
-        yield f"{azimuth:g}°, {elevation:g}° up", cells, shade
+        yield View(f"{azimuth:g}°, {elevation:g}° up", cells, shade)
 
 
 def _draw(panels: Sequence[Panel], figure: Any) -> None:

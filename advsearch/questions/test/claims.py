@@ -98,7 +98,7 @@ class Trial:
             worker, other = CLAIM_WORKER, self._problem(config.model_copy(update={"model": claim.than}))
             shared = shared.model_copy(update={"model": f"{config.model},{claim.than}"})
             if other.renderer.formation == problem.renderer.formation:
-                shown = lambda _, picture: picture.clone()  # noqa: E731
+                shown = _same_picture
         elif isinstance(claim, ChangeClaim):  # judged by what was true before it was changed
             shown = self._changed(claim, config, problem)
         sequence, least = ConfidenceSequence(self.suite.confidence, sides=1), least_mean(claim)
@@ -140,6 +140,7 @@ class Trial:
         return asked.model_copy(update=outcome)
 
     def _changed(self, claim: ChangeClaim, config: SceneConfig, problem: Problem) -> Callable[[Query, Tensor], Tensor]:
+        """Return what shows a model the changed picture of a query."""
         if claim.when != AWAY:
             return lambda query, picture: changed(picture, claim.when, problem.model.cameras)
         other = self._problem(config)
@@ -285,7 +286,8 @@ def valued(
     """Return what a picture says for a claim, from 0 to 1, or None where the object is not to be seen; how bad an
     example it is of what is against it, and which."""
     before = own.said.prediction
-    if before.label == OUT_OF_VIEW:
+    other_label = its.said.prediction.label if its is not None and isinstance(claim, NoWorseClaim) else None
+    if OUT_OF_VIEW in (before.label, other_label):  # pictures of two sizes need not show the same
         return None, 0.0, ""
     if its is None:
         badness = own.said.score if math.isfinite(own.said.score) else -math.inf
@@ -295,6 +297,10 @@ def valued(
         text = f"{before.label} before and {after.label} after"
         return float(as_claimed(claim.claim, before, after)), 0.0, text
     return (own.said.right - its.said.right + 1) / 2, 0.0, ""
+
+
+def _same_picture(_query: Query, picture: Tensor) -> Tensor:
+    return picture.clone()
 
 
 def spp_of(config: SceneConfig) -> int:
