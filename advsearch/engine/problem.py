@@ -388,7 +388,8 @@ class Problem:
             for side in (0.5 - half, 0.5 + half) if group.step_reason and group.size == 1 else ():
                 u[group.coordinates] = side  # in the middle of its range
                 ends.append(self.space.describe(u).get(group.name))
-            (low, high), step, unit = ends or (None, None), None, ""
+            low, high = ends or (None, None)
+            step, unit = None, ""
             if low is not None and high is not None and isinstance(low["value"], (int, float)):
                 step, unit = abs(float(high["value"]) - float(low["value"])) / 2.0, low["unit"]
             groups.append(GroupDerivative(**row, step_in_unit=step, unit=unit))

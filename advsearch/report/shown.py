@@ -344,8 +344,8 @@ class InNotebook:
             axes: to draw on; None makes new ones.
         """
         axes = new_axes() if axes is None else axes
-        drawn = [part.draw for part in shown(self).sections if part.draw is not None]  # type: ignore[arg-type]
-        for draw in drawn[:1]:
+        draw = next((part.draw for part in shown(self).sections if part.draw), None)  # type: ignore[arg-type]
+        if draw is not None:
             draw(axes)
         return axes
 

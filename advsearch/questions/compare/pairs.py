@@ -207,8 +207,13 @@ def compared(first: Side, second: Side, seed: int, *, rules: bool = True) -> Com
 
 def _counts(first: Mask, second: Mask, units: npt.NDArray[np.int64]) -> dict[str, Any]:
     difference, interval, _ = paired_by_unit(first, second, units)
-    of = {"both": first & second, "first_only": first & ~second, "second_only": ~first & second}
-    counts = {name: int(pairs.sum()) for name, pairs in {**of, "neither": ~first & ~second}.items()}
+    pairs = {
+        "both": first & second,
+        "first_only": first & ~second,
+        "second_only": ~first & second,
+        "neither": ~first & ~second,
+    }
+    counts = {name: int(those.sum()) for name, those in pairs.items()}
     return {**counts, "difference": difference, "interval": interval}
 
 

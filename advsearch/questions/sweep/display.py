@@ -447,8 +447,11 @@ def distance_sentence(found: SeenFrom) -> str:
     low, high, distance = (
         None if number is None else f"{number:.3g}" for number in (found.low, found.high, found.distance)
     )
-    ends = f"{low} to {high} {unit}" if low and high else f"at least {low} {unit}" if low else "no bound"
-    ends = f"at most {high} {unit}" if high and not low else ends
+    ends = "no bound"
+    if low and high:
+        ends = f"{low} to {high} {unit}"
+    elif low or high:
+        ends = f"at least {low} {unit}" if low else f"at most {high} {unit}"
     what = f"{ends} with 95 % confidence"
     what += "" if found.lacking is None else f" (that takes at least {found.lacking} pictures at each distance)"
     if distance is not None:
