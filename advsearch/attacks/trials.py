@@ -541,7 +541,6 @@ def fewer_by_chance(
         from scipy.stats import hypergeom  # takes half a second, and a search needs none of it
 
         here, there, right, others = (round(times * float(counts.sum())) for counts in (k, a, r, b))
-        from scipy.stats import hypergeom  # late: a quarter of a second, and searches need none
 
         return float(hypergeom.cdf(here, there + others, here + right, there))
     if (np.minimum(a, b) == 0.0).all() and len(np.unique(a + b)) == 1:
