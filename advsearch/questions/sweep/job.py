@@ -61,7 +61,7 @@ class NamedScene:
 @dataclass(frozen=True)
 class Job:
     """Everything that was asked for, found and loaded: `controls` are drawn by chance; `aovs` are layers of ground
-    truth that are kept of every picture of the first model (`scene.surfaces.AOVS`)."""
+    truth that are kept of every picture of the first model (`scene.formation.AOVS`)."""
 
     config: SweepConfig
     places: tuple[NamedScene, ...]
