@@ -5,9 +5,10 @@ from __future__ import annotations
 from advsearch.bundled.objects.cars import car
 from advsearch.bundled.objects.family import Instance, ObjectFamily
 from advsearch.bundled.objects.furniture import chair, lamp
-from advsearch.bundled.objects.kitchen import dumbbell, frying_pan, hammer, teapot
+from advsearch.bundled.objects.kitchen import frying_pan, teapot
 from advsearch.bundled.objects.people import person
 from advsearch.bundled.objects.things import ball, banana, book, stop_sign
+from advsearch.bundled.objects.tools import dumbbell, hammer
 from advsearch.bundled.objects.vessels import bottle, bowl, mug, vase, wine_glass
 
 _HOUSEHOLD = (
