@@ -64,7 +64,7 @@ def command(
     return lambda run: PlainCommand(run, arguments, more, examples)
 
 
-class Place(NamedTuple):
+class Positional(NamedTuple):
     """How what a question is about is given without its flag, the fields of `expected`."""
 
     metavar: str  # what the help calls it
@@ -95,9 +95,9 @@ class QuestionCommand:
     examples: tuple[str, ...] = ()
 
     @property
-    def place(self) -> Place | None:
+    def place(self) -> Positional | None:
         """How what it is about is given without its flag; None for not at all."""
-        return Place(*self.expected) if self.expected else None
+        return Positional(*self.expected) if self.expected else None
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         # late, so that --help answers at once
