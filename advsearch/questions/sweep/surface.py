@@ -279,7 +279,7 @@ UNTOLD, UNCOMPARED, NOTHING = (0.78, 0.78, 0.78), (0.45, 0.45, 0.45), (1.0, 1.0,
 ROWS = 2  # rows of the views of an object
 
 
-class SurfaceView(NamedTuple):
+class MapView(NamedTuple):
     """What a camera sees of an object: where it stands, as text; the number of the cell in each pixel (H, W), row by
     row of the map, -1 beside the object; and how bright that is (H, W)."""
 
@@ -295,10 +295,10 @@ class Panel(NamedTuple):
     title: str
     colours: Doubles
     difference: Doubles
-    views: tuple[SurfaceView, ...]
+    views: tuple[MapView, ...]
 
 
-def _views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[SurfaceView]:
+def _views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[MapView]:
     alone = framed(load_scene(asset, settings={"ground.size": 0.0}).description, SIDE_PIXELS)
     scene = MitsubaScene(alone, (SIDE_PIXELS, SIDE_PIXELS))
     for azimuth, elevation in SIDES:
@@ -308,7 +308,7 @@ def _views(asset: ObjectAsset, parts: SurfaceParts) -> Iterator[SurfaceView]:
         cells = np.full(there.shape, -1, np.int64)
         cells[there] = parts.cells(shown.face.numpy()[there], shown.uv.numpy()[there].astype(np.float64))
         shade = 0.7 + 0.3 * np.clip(shown.normal.numpy() @ np.array(LIGHT), 0.0, 1.0)
-        yield SurfaceView(f"{azimuth:g}°, {elevation:g}° up", cells, shade)
+        yield MapView(f"{azimuth:g}°, {elevation:g}° up", cells, shade)
 
 
 def _draw(panels: Sequence[Panel], figure: Any) -> None:
