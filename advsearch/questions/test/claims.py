@@ -107,10 +107,10 @@ class Trial:
         self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
         with executor_for(shared, worker, self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor, "0" if several else ""))
-            beside = Journal(self.run, Shared(other, executor, "1") if several else Shared(other))
-            queries = drawn(problem, kind, claim.pictures, spp)
-            alone = isinstance(claim, RightClaim)
-            for query, own, its in self._pairs(journal, queries, None if alone else beside, shown):
+            beside = None
+            if not isinstance(claim, RightClaim):
+                beside = Journal(self.run, Shared(other, executor, "1") if several else Shared(other))
+            for query, own, its in self._pairs(journal, drawn(problem, kind, claim.pictures, spp), beside, shown):
                 value, badness, text = valued(claim, own, its)
                 if value is None:
                     hidden += 1
