@@ -27,9 +27,7 @@ class TrackedKeys(Generic[T]):
     the same form the last counts; the earlier ones are in `repeated`.
     """
 
-    def __init__(
-        self, values: Mapping[str, T], *, fold: Callable[[str], str] = str, within: str = ""
-    ) -> None:
+    def __init__(self, values: Mapping[str, T], *, fold: Callable[[str], str] = str, within: str = "") -> None:
         self.repeated: list[str] = []  # keys, as spelled, that a later one of the same form hides
         self._fold = fold
         self._within = within
@@ -73,9 +71,7 @@ class TrackedKeys(Generic[T]):
                 self._read.add(key)
                 inner = {str(name): held for name, held in value.items()}
             spelled = self._spelling.get(key, key)
-            self._nested[key] = TrackedKeys(
-                inner, fold=self._fold, within=f"{self._within}{spelled}."
-            )
+            self._nested[key] = TrackedKeys(inner, fold=self._fold, within=f"{self._within}{spelled}.")
         return self._nested[key]
 
     def unread(self, is_quiet: Callable[[str, T], bool] | None = None) -> list[str]:
