@@ -116,7 +116,9 @@ OPTIONAL = {
 """Packages that only an extra brings, and which: imported inside a function that says what to do where it is not."""
 
 
-OF_A_PROCESS = {"advsearch.scene.importing.usd_stage": "pxr"}
+OF_A_PROCESS = {
+    f"advsearch.scene.importing.{name}": "pxr" for name in ("usd_layers", "usd_stage", "usd_surface")
+}
 """Modules that run in a process of their own, and what only they import, which an extra brings."""
 
 

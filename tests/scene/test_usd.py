@@ -219,16 +219,18 @@ def test_subsets_have_materials_of_their_own(tmp_path: Path) -> None:
 
 @needs_usd
 def test_numbers_and_pictures_of_a_preview_surface(tmp_path: Path) -> None:
-    """As glTF has them: two pictures of numbers become their means, the emission is linear, the colour times its
-    scale."""
+    """Two pictures of numbers become their means, of linear values as USD says of colours of 8 bits; the emission is
+    linear, the colour times its scale."""
     skin(tmp_path)
     st = np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.4], [0.1, 0.4]])  # the lower half, which is blue
     square = mesh(CUBE[[0, 4, 6, 2]], [[0, 1, 2, 3]], material="paint", st=st)
     paint = preview(diffuseColor="rgb", roughness="g", metallic="r", emissiveColor=(2.0, 1.0, 0.5))
     paint = paint.replace("float3 outputs:rgb", "float4 inputs:scale = (1, 1, 0.5, 1)\n            float3 outputs:rgb")
     found = import_object(written(tmp_path, square + paint))
-    assert found.material.roughness == pytest.approx(40 / 255, abs=0.01)
-    assert found.material.metallic == pytest.approx(40 / 255, abs=0.01)
+    decoded = ((40 / 255 + 0.055) / 1.055) ** 2.4
+    assert found.material.roughness == pytest.approx(decoded, abs=0.004)
+    assert found.material.metallic == pytest.approx(decoded, abs=0.004)
+    assert "roughness that is decoded from sRGB" in " ".join(found.warnings)
     assert found.emission is not None and np.allclose(found.emission.max(axis=(0, 1)), [2.0, 1.0, 0.5], rtol=0.01)
     dark = ((200 / 255 + 0.055) / 1.055) ** 2.4 * 0.5
     blue = found.base_color[-2, 1, 2]

@@ -55,7 +55,7 @@ SAID = {
     ),
     "a building (IFC)": ("make glTF of it: IfcConvert {file} {glb}", (".ifc",)),
     "a tile of 3D Tiles": ("take its glTF out: npx 3d-tiles-tools b3dmToGlb -i {file} -o {glb}", (".b3dm",)),
-    "a model of Gaussian splats": (SPLATS, (".splat", ".ksplat", ".spz")),
+    "a model of Gaussian splats": (SPLATS, (".splat", ".ksplat", ".spz", ".sog")),
     "a cloud of points": (POINTS, (".las", ".laz", ".pcd", ".e57", ".xyz", ".pts")),
     "an archive": (UNPACK, (".zip", ".gz", ".7z", ".rar", ".tar", ".tgz", ".gltfz")),
     "a file of Maya's": (ELSEWHERE, (".ma", ".mb")),
@@ -198,9 +198,10 @@ def is_number(word: str) -> bool:
     return "_" not in word
 
 
-def shown(name: str, *, quoted: bool = True) -> str:
-    """Return a name out of a file as a message shows it: control characters spelled out, cut to a length."""
-    kept = name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME // 2]
+def shown(name: str, *, quoted: bool = True, longest: int = _LONGEST_NAME) -> str:
+    """Return a name out of a file as a message shows it: control characters spelled out, cut to half of what is the
+    longest."""
+    kept = name if len(name) <= longest else name[: longest // 2]
     text = repr(kept) if quoted else repr(kept)[1:-1]
     return text if kept == name else f"{text}... ({len(name):,} characters)"
 

@@ -19,6 +19,7 @@ from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
 from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.importing.files import (
+    SPLATS,
     References,
     check_faces,
     check_most,
@@ -117,6 +118,11 @@ _LOOKS = ("KHR_materials_", "KHR_xmp")
 """Beginnings of those without which a file looks otherwise and has the same geometry: they are named in warnings."""
 
 
+def is_of_splats(name: str) -> bool:
+    """Whether an extension or an attribute holds Gaussian splats: KHR_gaussian_splatting, and those that pack it."""
+    return "gaussian_splat" in name.lower()
+
+
 def check_header(path: Path, header: Header) -> None:
     """Check what the types leave open: extensions, limits, and that whatever is referred to is there. Raises
     FileFormatError: the header needs what is not supported, refers to what is not there, or is over a limit."""
@@ -141,11 +147,15 @@ def check_header(path: Path, header: Header) -> None:
 
 
 def _needs(path: Path, names: Iterable[str]) -> FileFormatError:
+    names = list(names)
+    if any(map(is_of_splats, names)):
+        return FileFormatError(f"{path}: needs Gaussian splats, a model that {SPLATS}")
     named = shown(", ".join(names), quoted=False)
     return FileFormatError(f"{path}: needs {named}, which is not supported; export it without that option")
 
 
-def _unread_extensions(entry: Entry) -> list[str]:
+def unread_extensions(entry: Entry) -> list[str]:
+    """Return the names of an entry's extensions that are not understood."""
     held = (entry.model_extra or {}).get("extensions")
     return sorted(name for name in held if name not in READ) if isinstance(held, dict) else []
 
@@ -163,7 +173,9 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
     indices = None if primitive.indices is None else header.accessors[primitive.indices]
     for values in (*held.values(), indices):
         bare = values is not None and values.bufferView is None and values.sparse is None
-        if bare and (unread := _unread_extensions(primitive)):  # which has the numbers, as Draco's
+        unread = unread_extensions(primitive)
+        is_packed = bare and unread and not any(map(is_of_splats, unread))
+        if is_packed:  # an extension has the numbers, as Draco's
             raise _needs(path, unread)
     if indices is not None and indices.type != "SCALAR":
         raise damaged(path, "indices of type SCALAR", indices.type)
@@ -227,7 +239,7 @@ class GltfFile:
             try:
                 if uri is None and (number > 0 or self._chunk is None):
                     views = [view for view in self.header.bufferViews if view.buffer == number]
-                    if unread := {name for view in views for name in _unread_extensions(view)}:  # as meshopt's
+                    if unread := {name for view in views for name in unread_extensions(view)}:  # as meshopt's
                         raise _needs(self.path, sorted(unread))
                     raise damaged(self.path, f"a buffer {number} with content", "none")
                 self._read[number] = self.uri(uri) if uri is not None else self._chunk or b""

@@ -317,6 +317,7 @@ class MaterialEntry(Entry):
 
 
 REPEAT, MIRRORED, CLAMPED = 10497, 33648, 33071  # how a texture goes on beyond its edges
+BORDER = 33069  # nothing beyond the edges: OpenGL's and USD's, not glTF's
 NEAREST = 9728  # the filter that leaves texels sharp
 
 

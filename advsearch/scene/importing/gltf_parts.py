@@ -16,10 +16,11 @@ from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Doubles, Floats, Ints, face_vectors, linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import gltf_entries, gltf_skeleton
 from advsearch.scene.importing.blender import GENERATOR
-from advsearch.scene.importing.files import Notes, check_faces, damaged, shown
-from advsearch.scene.importing.gltf import READ, GltfFile
+from advsearch.scene.importing.files import SPLATS, Notes, check_faces, damaged, shown
+from advsearch.scene.importing.gltf import READ, GltfFile, is_of_splats, unread_extensions
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header, MaterialEntry, Primitive, Sampler, TextureUse
 from advsearch.scene.importing.parts import (
+    FLAT,
     ImportedPart,
     ImportedSurface,
     instead_of_texture,
@@ -49,6 +50,7 @@ EXTENSIONS = {
 }
 """What becomes of a file with an extension; of all that are not named here, nor understood, `UNKNOWN`."""
 UNKNOWN = " uses {name}, which is not understood and left out"
+LONGEST_SENTENCE = 500  # characters of what the reader of OpenUSD says
 FAR = 1000.0  # distance of a directional light, in object sizes
 
 
@@ -57,10 +59,13 @@ def left_out(header: Header, notes: Notes) -> None:
     if header.asset.generator == GENERATOR and isinstance(header.asset.extras, dict):
         sentences = header.asset.extras.get("left_out")
         for what in sentences if isinstance(sentences, list) else ():
-            notes.say(" " + shown(str(what), quoted=False))
+            notes.say(" " + shown(str(what), quoted=False, longest=LONGEST_SENTENCE))
+    if any(map(is_of_splats, {*header.extensionsUsed, *header.extensionsRequired})):
+        notes.say(f" has Gaussian splats, which are left out: a model that {SPLATS}")
     used = {*header.extensionsUsed, *header.extensionsRequired}
     for name in sorted(used & set(EXTENSIONS) | used - set(READ)):
-        notes.say(EXTENSIONS.get(name, UNKNOWN).format(name=shown(name, quoted=False)))
+        if not is_of_splats(name):
+            notes.say(EXTENSIONS.get(name, UNKNOWN).format(name=shown(name, quoted=False)))
     drawn = header.below(header.scenes[header.scene or 0].nodes if header.scenes else range(len(header.nodes)))
     looks = header.materials
     kinds = {
@@ -109,7 +114,8 @@ def _note_unread(header: Header, notes: Notes) -> None:
             material = None if primitive.material is None else header.materials[primitive.material]
             read = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0", material.attribute if material else ""}
             for name in primitive.attributes:
-                if name not in read and not (header.skins and name.startswith(("JOINTS_", "WEIGHTS_"))):
+                is_of_skin = header.skins and name.startswith(("JOINTS_", "WEIGHTS_"))
+                if name not in read and not is_of_skin and not is_of_splats(name):
                     notes.has("attribute", name)
 
 
@@ -248,6 +254,8 @@ class GltfSurfaces:
         uses = (material.surface.baseColorTexture, material.normalTexture, material.emissiveTexture)  # the layout first
         samplers = [self._sampler(use) for use in uses if use is not None and material.reads(use)]
         pictures = list(surface.pictures)
+        normals_at = 0 if surface.texture is None else 1  # if there are any
+        normals_at = -1 if surface.normal_map is None else normals_at
         if not pictures or not len(places) or not np.isfinite(places).all():
             return surface, scale, shift
         for axis, wraps in enumerate(([use.wrapS for use in samplers], [use.wrapT for use in samplers])):
@@ -261,10 +269,15 @@ class GltfSurfaces:
             )
             if out and len(set(wraps)) > 1:
                 self.notes.say(EDGES)
+            if wraps[0] == gltf_entries.BORDER and out:
+                pictures = [_enlarged(picture, side) for picture in pictures]
+                sizes = [picture.shape[side] for picture in pictures]
             if wraps[0] == gltf_entries.MIRRORED and out:
                 pictures = [np.concatenate([picture, np.flip(picture, side)], axis=side) for picture in pictures]
                 scale[axis] = 0.5
-            elif wraps[0] in (gltf_entries.CLAMPED, gltf_entries.MIRRORED) and (out or any(differ)):
+            elif wraps[0] in (gltf_entries.CLAMPED, gltf_entries.BORDER, gltf_entries.MIRRORED) and (
+                out or any(differ)
+            ):
                 unit_size = int(np.gcd.reduce(sizes))  # pads are whole texels of each
                 before, after = (max(0, int(np.ceil(beyond * unit_size))) + 1 for beyond in (-low, high - 1.0))
                 total = unit_size + before + after
@@ -275,8 +288,28 @@ class GltfSurfaces:
                     step = size // unit_size
                     texels = np.clip(np.arange(-before * step, (unit_size + after) * step), 0, size - 1)
                     pictures[number] = np.take(pictures[number], texels, side)
+                    if wraps[0] == gltf_entries.BORDER and out:
+                        beyond = np.arange(len(texels)) // step
+                        is_outside = (beyond < before) | (beyond >= before + unit_size)
+                        along_axis = np.moveaxis(pictures[number], side, 0)
+                        along_axis[is_outside] = FLAT if number == normals_at else 0.0
                 scale[axis], shift[axis] = unit_size / total, before / total
         return surface.with_pictures(pictures), scale, shift
+
+
+def _enlarged(picture: Floats, axis: int) -> Floats:
+    """Return a picture with at least `SMALL` texels along an axis, of which a border of one is not seen."""
+    size = picture.shape[axis]
+    times = -(-SMALL // size)
+    if times == 1:
+        return picture
+    position = ((np.arange(size * times) + 0.5) / times - 0.5).clip(0.0, size - 1.0)
+    lower = np.floor(position).astype(np.int64)
+    shape = [1] * picture.ndim
+    shape[axis] = -1
+    share = (position - lower).reshape(shape).astype(np.float32)
+    upper = np.minimum(lower + 1, size - 1)
+    return np.asarray(np.take(picture, lower, axis) * (1.0 - share) + np.take(picture, upper, axis) * share)
 
 
 # --- primitives in their places --------------------------------------------------------------------------------------
@@ -302,11 +335,15 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     }
     with_faces = {key: piece for key, piece in pieces.items() if piece is not None and len(piece.part.faces)}
     if not with_faces:
+        if any(map(is_of_splats, header.extensionsUsed)):
+            raise FileFormatError(f"{path}: expected a mesh with faces, got Gaussian splats, a model that {SPLATS}")
         got = "points or lines only" if pieces else "none"
         raise FileFormatError(f"{path}: expected a mesh with faces, got {got}; export triangles")
     left_out(header, notes)
-    if len(with_faces) < len(pieces):
-        notes.say(f"{len(pieces) - len(with_faces)} parts without faces (points, lines) are left out")
+    primitives = [header.meshes[mesh].primitives[number] for mesh, number in pieces]
+    splats = sum(any(map(is_of_splats, unread_extensions(primitive))) for primitive in primitives)
+    if without_faces := len(pieces) - len(with_faces) - splats:
+        notes.say(f"{without_faces} parts without faces (points, lines) are left out")
     clear = {mesh for (mesh, _), piece in with_faces.items() if piece.see_through}
     bare = {mesh for (mesh, _), piece in with_faces.items() if piece.material is None}
     for sentence in _counts({SEE_THROUGH: [True] * len(clear), DEFAULT: [True] * len(bare)}):

@@ -6,41 +6,32 @@ first one or below. What glTF as we read it has no place for is named in `asset.
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import os
-import re
 import sys
-import zipfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
+from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
-from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.pictures import FORMATS, check_decodable
 from advsearch.scene.assets import face_vectors
-from advsearch.scene.glb import GlbBuffer, mime_type
-from advsearch.scene.importing.blender import GENERATOR, LAYERS, PACKAGE
-from advsearch.scene.importing.files import LARGEST_FILE, check_faces, check_most
+from advsearch.scene.glb import GlbBuffer
+from advsearch.scene.importing.blender import GENERATOR, PACKAGE
+from advsearch.scene.importing.files import SPLATS, check_faces, check_most
 from advsearch.scene.importing.geometry import triangulated
 from advsearch.scene.importing.gltf import DEEPEST_TREE, LARGEST_TREE
+from advsearch.scene.importing.usd_layers import check_layers, unpacked
+from advsearch.scene.importing.usd_surface import FIRST, Bound, Layout, PrimvarUse, Surfaces
 
-FIRST = Usd.TimeCode.EarliestTime()
-MOST_LAYERS = 1000
-MOST_ENTRIES = 10_000
+MOST_TINTS = 16  # colours and opacities of faces that are materials of their own; of more, colours are of vertices
+PARTICLES = "ParticleField"  # how the types of Gaussian splats and their like begin
 PURPOSES = ("default", "render")
-WRAPS = {"repeat": 10497, "mirror": 33648, "clamp": 33071, "black": 33071, "useMetadata": 10497}
-COAT = ("clearcoat", "displacement", "occlusion", "specularColor")
-"""Inputs of a preview surface that our surfaces have nothing for."""
 Array = npt.NDArray[Any]
 
 
@@ -50,89 +41,11 @@ def main(source: str, target: str, folder: str) -> None:
     file = Path(source)
     if file.suffix.lower() == PACKAGE:
         file = unpacked(file, Path(folder))
-    layers = checked_layers(file)
+    layers = check_layers(file)
     stage = Usd.Stage.Open(str(file))
-    made = Conversion(stage, file.parent.resolve(), Path(source).name)
-    made.read = layers
+    made = Conversion(stage, file.parent.resolve(), Path(source).name, layers)
     Path(target).write_bytes(made.glb())
     print(json.dumps(made.read if file == Path(source) else []))
-
-
-# ---- what a file may name -------------------------------------------------------------------------------------------
-
-
-def unpacked(package: Path, folder: Path) -> Path:
-    """Unpack a .usdz file, and return its first layer."""
-    try:
-        with zipfile.ZipFile(package) as archive:
-            entries = archive.infolist()
-            got = f"{len(entries):,} of {(size := sum(entry.file_size for entry in entries)):,}"
-            most = f"at most {files.scaled(MOST_ENTRIES):,} files of {files.scaled(LARGEST_FILE):,} bytes in all"
-            check_most(package.name, len(entries), MOST_ENTRIES, most, got)
-            check_most(package.name, size, LARGEST_FILE, most, got)
-            for entry in entries:
-                place = PurePosixPath(entry.filename)
-                odd = place.is_absolute() or ".." in place.parts or "\\" in entry.filename or ":" in entry.filename
-                if odd or entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
-                    raise FileFormatError(
-                        f"{package.name}: expected files that lie in it as they are, got {entry.filename[:80]!r}, "
-                        "which is packed or lies elsewhere; make it again with usdzip"
-                    )
-                if not entry.is_dir():
-                    goal = folder / place
-                    goal.parent.mkdir(parents=True, exist_ok=True)
-                    goal.write_bytes(archive.read(entry))
-    except (zipfile.BadZipFile, OSError, EOFError, ValueError, NotImplementedError) as error:
-        raise FileFormatError(f"{package.name}: expected a .usdz archive, got one that is damaged ({error})") from None
-    first = next((entry.filename for entry in entries if not entry.is_dir()), "")
-    if Path(first).suffix.lower() not in LAYERS:
-        raise FileFormatError(f"{package.name}: expected a USD layer first in it, got {first[:80]!r}")
-    return folder / first
-
-
-def checked_layers(file: Path) -> list[str]:
-    """Return the files of all layers that a file is made of, itself first; refuse what it names elsewhere."""
-    folder, waiting, known, size = file.parent.resolve(), [file.resolve()], dict[Path, None](), 0
-    while waiting:
-        path = waiting.pop()
-        if path in known:
-            continue
-        known[path], size = None, size + path.stat().st_size
-        most = f"at most {files.scaled(MOST_LAYERS):,} layers"
-        for count, limit in ((len(known), MOST_LAYERS), (size, LARGEST_FILE)):
-            check_most(file.name, count, limit, most, "more, or larger ones")
-        try:
-            layer = Sdf.Layer.FindOrOpen(str(path))
-        except Exception as error:  # Tf.ErrorException, of which there are many kinds
-            raise FileFormatError(f"{path.name}: expected a USD layer, got {_short(error)}") from None
-        if layer is None:
-            raise FileFormatError(f"{path.name}: expected a USD layer, got none that can be read")
-        for name in filter(None, layer.GetCompositionAssetDependencies()):
-            plain = not any(sign in name for sign in "`[]:\0") and Path(name).suffix.lower() in LAYERS
-            named = Path(os.path.realpath(path.parent / name)) if plain else folder
-            if not plain or not named.is_relative_to(folder):
-                raise FileFormatError(
-                    f"{file.name}: names the layer {name[:100]!r}, which is no USD file in its folder and is not read; "
-                    "put it there, or make one file of all with usdcat"
-                )
-            if not named.is_file():
-                raise FileFormatError(f"{file.name}: needs {name[:100]!r}, which is missing; put that file beside it")
-            waiting.append(named)
-
-        def check(at: Any, layer: Any = layer) -> None:
-            spec = layer.GetObjectAtPath(at) if at.IsPrimPath() else None
-            if spec is not None and "clips" in spec.ListInfoKeys():
-                what = f"has value clips ({at}), which are not read"
-                raise FileFormatError(f"{file.name}: {what}; make one file of all with usdcat")
-
-        layer.Traverse(Sdf.Path.absoluteRootPath, check)
-    return [str(path) for path in known]
-
-
-def _short(error: Exception) -> str:
-    said = re.findall(r":(\d+:\d+: .+)", str(error)) or re.findall(r" : '(.+)", str(error))
-    lines = said or [line.strip() for line in str(error).splitlines() if len(line.strip()) > 3]
-    return (lines[-1] if lines else type(error).__name__)[:200]
 
 
 # ---- the stage ------------------------------------------------------------------------------------------------------
@@ -145,7 +58,7 @@ class Conversion:
     stage: Any
     folder: Path
     source: str
-    read: list[str] = field(default_factory=list)
+    read: list[str]
     left: Counter[str] = field(default_factory=Counter)
     buffer: GlbBuffer = field(default_factory=GlbBuffer)
     triangles: int = 0
@@ -154,8 +67,8 @@ class Conversion:
         self.header: dict[str, Any] = {name: [] for name in ("nodes", "meshes", "materials", "textures", "images")}
         self.header |= {"samplers": [], "cameras": [], "asset": {"version": "2.0", "generator": GENERATOR}}
         self.lights: list[dict[str, Any]] = []
-        self._materials: dict[str, tuple[int, str]] = {}
-        self._skins, self.transforms = UsdSkel.Cache(), dict[int | None, Array]()
+        self._surfaces = Surfaces(self.folder, self.header, self.buffer, self.left, self.read)
+        self._skins = UsdSkel.Cache()
         for prim in self._prims():
             if prim.IsA(UsdSkel.Root):
                 self._skins.Populate(UsdSkel.Root(prim), Usd.TraverseInstanceProxies())
@@ -182,9 +95,12 @@ class Conversion:
         nodes.append({"name": "stage", "matrix": matrix.T.ravel().tolist(), "children": []})
         names = Counter(prim.GetName() for prim in self._prims())
         places: dict[Any, int] = {}
+        has_splats = False
         for prim in self._prims():
-            kind = prim.GetTypeName()
-            if (prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh)) or kind == "PointInstancer":
+            kind = str(prim.GetTypeName())
+            if kind.startswith(PARTICLES):
+                has_splats = True
+            elif (prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh)) or kind == "PointInstancer":
                 self._leave(f"has a {kind}, which is no mesh: left out; make meshes of it where the file is from")
             if prim.HasAPI(UsdSkel.BindingAPI) and UsdSkel.BindingAPI(prim).GetBlendShapesAttr().HasAuthoredValue():
                 self._leave("has a mesh with blend shapes, which are left out")
@@ -212,9 +128,14 @@ class Conversion:
             if not node["children"]:
                 del node["children"]
         header["scenes"], header["scene"] = [{"nodes": [0]}], 0
+        if has_splats and not header["meshes"]:
+            what = f"expected a mesh with faces, got Gaussian splats, a model that {SPLATS}"
+            raise FileFormatError(f"{self.source}: {what}")
         if self.lights:
             header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
         notes = [what if count == 1 else f"{what} ({count:,} times)" for what, count in self.left.items()]
+        if has_splats:
+            notes.insert(0, f"has Gaussian splats, which are left out: a model that {SPLATS}")
         header["asset"]["extras"] = {"left_out": notes[:100]}
         return self.buffer.file({key: value for key, value in header.items() if value or key == "asset"})
 
@@ -309,51 +230,117 @@ class Conversion:
             self._leave("has a mesh that is to be subdivided, which is shown as it is, and smooth")
             normals = _smooth(points, corners[picked]), "vertex"
         primitives = []
-        for material, uv_name, faces in self._groups(prim, mesh, len(counts)):
-            mine = np.isin(face, faces) if faces is not None else np.ones(len(face), bool)
-            at = picked[mine].reshape(-1)
-            if not len(at):
-                continue
-            uvs = _flattened(primvars.FindPrimvarWithInheritance(uv_name), 2)
-            if uvs is not None:  # as glTF has them, v down, with the transform that the material asks for
-                turned = self.transforms.get(material, np.eye(3)) if material is not None else np.eye(3)
-                moved_uvs = uvs[0] @ turned[:2, :2].T + turned[:2, 2]
-                uvs = np.stack([moved_uvs[:, 0], 1.0 - moved_uvs[:, 1]], axis=1), uvs[1]
-            colors = None  # which only count where there is no material
-            if material is None:
-                colors = _flattened(primvars.FindPrimvarWithInheritance("displayColor"), 3)
-            by = {"vertex": corners[at], "varying": corners[at], "faceVarying": at, "uniform": face[mine].repeat(3)}
-            held = {"NORMAL": normals, "TEXCOORD_0": uvs, "COLOR_0": colors}
-            index, none = [corners[at]], np.zeros(len(at), np.int64)
-            for values, per in (given or (None, "") for given in held.values()):
-                index.append(none if values is None else by.get(per, none))
-                if values is not None and index[-1].max() >= len(values):
-                    raise FileFormatError(f"{self.source}: expected as many values as corners on {path}, got fewer")
-            rows, inverse = np.unique(np.stack(index, axis=1), axis=0, return_inverse=True)
-            attributes = {"POSITION": self.buffer.accessor(points[rows[:, 0]].astype(np.float32), "VEC3", bounds=True)}
-            for column, (name, given) in enumerate(held.items(), 1):
-                if given is not None:
-                    values = given[0][rows[:, column]].astype(np.float32)
-                    attributes[name] = self.buffer.accessor(values, f"VEC{values.shape[1]}")
-            entry = {"attributes": attributes, "mode": 4}
-            entry["indices"] = self.buffer.accessor(inverse.reshape(-1).astype(np.uint32), "SCALAR")
-            primitives.append(entry if material is None else {**entry, "material": material})
+        for bound, faces in self._groups(prim, mesh, len(counts)):
+            for material, colors, tinted in self._tinted(bound, primvars, faces, counts, corners):
+                mine = np.isin(face, tinted)
+                at = picked[mine].reshape(-1)
+                if not len(at):
+                    continue
+                held: dict[str, tuple[Array, str] | None] = {"NORMAL": normals, "COLOR_0": colors}
+                for number, layout in enumerate(bound.layouts):
+                    held[f"TEXCOORD_{number}"] = self._uvs(primvars, layout)
+                entry = self._primitive(path, points, corners, at, face[mine], held)
+                primitives.append({**entry, "material": material})
         if primitives:
             node["mesh"] = len(self.header["meshes"])
             self.header["meshes"].append({"name": node["name"], "primitives": primitives})
 
-    def _groups(self, prim: Any, mesh: Any, faces: int) -> Iterator[tuple[int | None, str, Array | None]]:
-        """Yield the materials of a mesh: number, name of the texture coordinates, and faces (None for all)."""
+    def _primitive(
+        self,
+        path: str,
+        points: Array,
+        corners: Array,
+        at: Array,
+        face: Array,
+        held: dict[str, tuple[Array, str] | None],
+    ) -> dict[str, Any]:
+        """Return a primitive of some corners, `at`, of faces, with the values that it has by what each belongs to."""
+        by = {"vertex": corners[at], "varying": corners[at], "faceVarying": at, "uniform": face.repeat(3)}
+        index, none = [corners[at]], np.zeros(len(at), np.int64)
+        for values, per in (given or (None, "") for given in held.values()):
+            index.append(none if values is None else by.get(per, none))
+            if values is not None and index[-1].max() >= len(values):
+                raise FileFormatError(f"{self.source}: expected as many values as corners on {path}, got fewer")
+        rows, inverse = np.unique(np.stack(index, axis=1), axis=0, return_inverse=True)
+        attributes = {"POSITION": self.buffer.accessor(points[rows[:, 0]].astype(np.float32), "VEC3", bounds=True)}
+        for column, (name, given) in enumerate(held.items(), 1):
+            if given is not None:
+                values = given[0][rows[:, column]].astype(np.float32)
+                attributes[name] = self.buffer.accessor(values, f"VEC{values.shape[1]}")
+        indices = self.buffer.accessor(inverse.reshape(-1).astype(np.uint32), "SCALAR")
+        return {"attributes": attributes, "mode": 4, "indices": indices}
+
+    def _uvs(self, primvars: Any, layout: Layout) -> tuple[Array, str] | None:
+        """Return texture coordinates as glTF has them, v down, with the transform that the material asks for."""
+        values = None
+        if layout.primvar:
+            values = _flattened(primvars.FindPrimvarWithInheritance(layout.primvar), 2)
+        if values is None:
+            if layout.fallback is None:
+                return None
+            if layout.primvar:
+                name = layout.primvar[:50]
+                self._leave(f"has a mesh without the primvar {name!r} of a texture, of which one texel is shown")
+            values = np.array([layout.fallback]), "constant"
+        moved = layout.moved(values[0])
+        return np.stack([moved[:, 0], 1.0 - moved[:, 1]], axis=1), values[1]
+
+    def _tinted(
+        self, bound: Bound, primvars: Any, faces: Array, counts: Array, corners: Array
+    ) -> Iterator[tuple[int, tuple[Array, str] | None, Array]]:
+        """Yield materials, vertex colours and faces: by the primvars that a surface takes colour and opacity from."""
+        if bound.color is None and bound.opacity is None:
+            yield bound.number, None, faces
+            return
+        colors, shares = (_primvar_values(primvars, use) for use in (bound.color, bound.opacity))
+        start = np.cumsum(counts) - counts
+
+        def per_face(given: tuple[Array, str]) -> Array:
+            """The values (F, C) of faces; of those of corners, the means."""
+            values, per = given
+            if per in ("constant", "uniform"):
+                index = faces if per == "uniform" else np.zeros(len(faces), np.int64)
+                return values[np.minimum(index, len(values) - 1)]
+            at = corners if per in ("vertex", "varying") else np.arange(len(corners))
+            all_values = values[np.minimum(at, len(values) - 1)]
+            sums = np.add.reduceat(np.concatenate([all_values, np.zeros((1, values.shape[1]))]), start)
+            return np.asarray((sums / np.maximum(counts, 1)[:, None])[faces])
+
+        opacity = np.full((len(faces), 1), np.nan)  # as the material has it
+        if shares is not None:
+            opacity = np.round(per_face(shares).clip(0.0, 1.0) * 255.0) / 255.0
+            if shares[1] not in ("constant", "uniform") and len(np.unique(shares[0])) > 1:
+                self._leave("has an opacity of vertices, of which faces have the mean")
+        if len(np.unique(opacity)) > MOST_TINTS:
+            self._leave(f"has more than {MOST_TINTS} opacities of faces, of which the mean is read")
+            opacity = np.full_like(opacity, opacity.mean())
+        tints = np.full((len(faces), 3), np.nan)
+        vertex_colors = colors
+        if colors is not None and colors[1] in ("constant", "uniform"):
+            face_colors = per_face(colors)
+            if len(np.unique(face_colors, axis=0)) <= MOST_TINTS:
+                tints, vertex_colors = face_colors, None
+        keys = np.nan_to_num(np.concatenate([tints, opacity], axis=1), nan=-1.0)
+        for key in np.unique(keys, axis=0):
+            chosen = (keys == key).all(axis=1)
+            color = None if colors is None else key[:3]
+            if vertex_colors is not None:
+                color = np.ones(3)  # which the vertices multiply
+            number = self._surfaces.tinted(bound, color, None if key[3] < 0.0 else key[3])
+            yield number, vertex_colors, faces[chosen]
+
+    def _groups(self, prim: Any, mesh: Any, faces: int) -> Iterator[tuple[Bound, Array]]:
+        """Yield the materials of a mesh and their faces."""
         subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
         rest = np.ones(faces, bool)
         for subset in subsets:
-            chosen = _array(_first(subset, "Indices"), np.int64)
+            chosen = np.unique(_array(_first(subset, "Indices"), np.int64))
             chosen = chosen[(chosen >= 0) & (chosen < faces)]
             chosen = chosen[rest[chosen]]
             rest[chosen] = False
-            yield *self._material(subset.GetPrim()), chosen
+            yield self._surfaces.bound_to(subset.GetPrim()), chosen
         if rest.any():
-            yield *self._material(prim), np.flatnonzero(rest) if subsets else None
+            yield self._surfaces.bound_to(prim), np.flatnonzero(rest)
 
     def _at_rest(self, prim: Any, points: Array) -> tuple[Array | None, Array]:
         """Points of a mesh whose skeleton is at rest, and where they lie (4, 4), rows; (None, points) without one."""
@@ -377,213 +364,6 @@ class Conversion:
         place = UsdGeom.Xformable(bound.GetPrim()).ComputeLocalToWorldTransform(FIRST)
         return np.array(place), _array(skinned, np.float64, 3)
 
-    # ---- materials ---------------------------------------------------------------------------------------------------
-
-    def _material(self, prim: Any) -> tuple[int | None, str]:
-        """The number of what a prim is made of, and the name of its texture coordinates; (None, "st") of none."""
-        binding = UsdShade.MaterialBindingAPI(prim)
-        bound = binding.ComputeBoundMaterial(UsdShade.Tokens.preview)[0] or binding.ComputeBoundMaterial()[0]
-        if not bound:
-            return None, "st"
-        path = str(bound.GetPath())
-        if path not in self._materials:
-            entry: dict[str, Any] = {"name": str(bound.GetPrim().GetName()), "doubleSided": True}
-            number = len(self.header["materials"])
-            self.header["materials"].append(entry)
-            self._materials[path] = number, self._look(bound.ComputeSurfaceSource()[0], number, entry)
-        return self._materials[path]
-
-    def _look(self, shader: Any, number: int, entry: dict[str, Any]) -> str:
-        """Fill the entry of a material; return the name of its texture coordinates."""
-        surface = entry["pbrMetallicRoughness"] = dict[str, Any]()
-        if not shader or shader.GetIdAttr().Get() != "UsdPreviewSurface":
-            self._leave("has a material that is no UsdPreviewSurface, which is grey here")
-            grey = [0.2140, 0.2140, 0.2140, 1.0]
-            surface |= {"baseColorFactor": grey, "metallicFactor": 0.0, "roughnessFactor": 0.5}
-            return "st"
-        inputs = Inputs(self, shader, number)
-        color, base = inputs.color("diffuseColor", (0.18, 0.18, 0.18)), inputs.texture("diffuseColor", "rgb")
-        opacity, cutoff = inputs.number("opacity", 1.0), inputs.number("opacityThreshold", 0.0)
-        cut = inputs.texture("opacity", "a")
-        if base is not None:
-            surface["baseColorTexture"] = {"index": base}
-        if cut is not None and cut != base:
-            self._leave("has an opacity of another picture than the colour's, which is left out")
-        if cut is not None or inputs.source("opacity") is not None:
-            opacity = 1.0
-        surface["baseColorFactor"] = [*color, opacity]
-        if opacity < 1.0 or (cut is not None and cut == base):
-            entry |= {"alphaMode": "MASK", "alphaCutoff": cutoff} if cutoff > 0.0 else {"alphaMode": "BLEND"}
-        rough, metallic = inputs.number("roughness", 0.5), inputs.number("metallic", 0.0)
-        packed = self._packed(inputs, rough, metallic)
-        if packed is None:
-            surface |= {"metallicFactor": metallic, "roughnessFactor": rough}
-        else:
-            surface |= {"metallicFactor": 1.0, "roughnessFactor": 1.0, "metallicRoughnessTexture": {"index": packed}}
-        for slot, name in {"normalTexture": "normal", "emissiveTexture": "emissiveColor"}.items():
-            if (texture := inputs.texture(name, "rgb")) is not None:
-                entry[slot] = {"index": texture}
-        glow = inputs.color("emissiveColor", (0.0, 0.0, 0.0))
-        if (most := max(glow)) > 0.0:
-            entry["emissiveFactor"] = [channel / max(most, 1.0) for channel in glow]
-            if most > 1.0:
-                entry["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": most}}
-        specular = bool(inputs.number("useSpecularWorkflow", 0.0))
-        for name in COAT:
-            value, usual = inputs.value(name), {"occlusion": 1.0, "specularColor": None}.get(name, 0.0)
-            set_to = inputs.source(name) is not None or (value is not None and value != usual)
-            if set_to and (specular or name != "specularColor"):
-                self._leave(f"has materials with {name}, which is left out")
-        if specular:
-            self._leave("has materials with a specular workflow, of which the diffuse colour is read")
-        if abs(inputs.number("ior", 1.5) - 1.5) > 1e-3:
-            self._leave("has materials with an ior other than 1.5, which is left out")
-        return inputs.uv_name
-
-    def _packed(self, inputs: Inputs, rough: float, metallic: float) -> int | None:
-        planes = [inputs.plane(name) for name in ("roughness", "metallic")]
-        size = next((plane.size for plane in planes if plane is not None), None)
-        if size is None:
-            return None
-        channels = [
-            Image.new("L", size, round(255 * min(max(value, 0.0), 1.0))) if plane is None else plane.resize(size)
-            for plane, value in zip(planes, (rough, metallic), strict=True)
-        ]
-        file = io.BytesIO()
-        Image.merge("RGB", [Image.new("L", size, 255), *channels]).save(file, "PNG")
-        return self.add_texture(file.getvalue(), {"wrapS": 10497, "wrapT": 10497})
-
-    def image(self, asset: Any, name: str) -> bytes | None:
-        """The bytes of a picture in the folder; None, and a note, of one that is not there."""
-        path = str(asset.path)
-        resolved = os.path.realpath(str(asset.resolvedPath) or str(self.folder / path))
-        inside = Path(resolved).is_relative_to(self.folder)
-        if not inside or not os.path.isfile(resolved):
-            why = "is missing" if inside else "is outside its folder and is not read"
-            self._leave(f"the texture {path[:100]!r} of {name} {why}")
-            return None
-        self.read.append(resolved)
-        return files.read_bytes(Path(resolved), "a picture", LARGEST_FILE)
-
-    def add_texture(self, data: bytes, sampler: Mapping[str, int]) -> int:
-        image = self._numbered("images", {"mimeType": mime_type(data), "bufferView": self.buffer.view(data)})
-        return self._numbered("textures", {"source": image, "sampler": self._numbered("samplers", sampler)})
-
-    def _numbered(self, kind: str, entry: Mapping[str, Any]) -> int:
-        entries: list[Mapping[str, Any]] = self.header[kind]
-        if entry not in entries:
-            entries.append(entry)
-        return entries.index(entry)
-
-
-@dataclass
-class Inputs:
-    """The inputs of a preview surface: numbers, and the pictures that they are connected to."""
-
-    conversion: Conversion
-    shader: Any
-    material: int
-    uv_name: str = "st"
-
-    def source(self, name: str) -> tuple[Any, str] | None:
-        """The shader, and its output, that an input has in place of its own value."""
-        for attribute in _producing(self.shader, name):
-            prim = UsdShade.Shader(attribute.GetPrim())
-            if prim and UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output:
-                return prim, UsdShade.Utils.GetBaseNameAndType(attribute.GetName())[0]
-        return None
-
-    def value(self, name: str) -> Any:
-        return None if self.source(name) is not None else _produced(self.shader, name)
-
-    def number(self, name: str, otherwise: float) -> float:
-        """A number; that of the format where the surface says none."""
-        value = self.value(name)
-        number = otherwise if value is None else float(value)
-        return number if math.isfinite(number) else otherwise
-
-    def color(self, name: str, otherwise: tuple[float, float, float]) -> tuple[float, ...]:
-        """A linear colour: of a picture, what it is multiplied by."""
-        source = self.source(name)
-        if source is not None:
-            scale = source[0].GetInput("scale")
-            value, otherwise = (scale.Get(FIRST) if scale else None), (1.0, 1.0, 1.0)
-        else:
-            value = self.value(name)
-        return otherwise if value is None else tuple(map(float, value[:3]))
-
-    def _picture(self, name: str) -> tuple[bytes, Any, str] | None:
-        source = self.source(name)
-        if source is None:
-            return None
-        texture, output = source
-        if texture.GetIdAttr().Get() != "UsdUVTexture":
-            self.conversion._leave(f"has a {name} of {texture.GetIdAttr().Get()}, which is left out")
-            return None
-        path = _produced(texture, "file")
-        if path is None:
-            return None
-        if "<UDIM>" in str(path.path):
-            self.conversion._leave("has UDIM textures, which are left out; make .obj or one texture of them")
-            return None
-        data = self.conversion.image(path, self.shader.GetPrim().GetParent().GetName())
-        return None if data is None else (data, texture, output)
-
-    def texture(self, name: str, output: str) -> int | None:
-        """The number of the texture that an input shows; None where there is none, or it cannot be read."""
-        picture = self._picture(name)
-        if picture is None:
-            return None
-        data, texture, shown = picture
-        if shown != output:
-            self.conversion._leave(f"has a {name} of the output {shown!r} of a picture, which is left out")
-            return None
-        return self.conversion.add_texture(data, self._sampler(texture, name))
-
-    def plane(self, name: str) -> Image.Image | None:
-        """The picture of 8 bits of an input that is one number."""
-        picture = self._picture(name)
-        if picture is None:
-            return None
-        data, texture, output = picture
-        self._sampler(texture, name)
-        try:
-            with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-                check_decodable(image, name)
-                planes: tuple[Image.Image, ...] = image.convert("RGBA").split()
-        except (OSError, ValueError, SyntaxError) as error:
-            self.conversion._leave(f"has a picture of {name} that cannot be read ({_short(error)})")
-            return None
-        return planes["rgba".index(output)] if output in tuple("rgba") else planes[0]
-
-    def _sampler(self, texture: Any, name: str) -> dict[str, int]:
-        wraps = []
-        for axis in ("wrapS", "wrapT"):
-            given = texture.GetInput(axis)
-            word = str(given.Get(FIRST)) if given and given.Get(FIRST) is not None else "useMetadata"
-            if word == "black":
-                self.conversion._leave("has a texture that is black beyond its edges, which goes on as at them here")
-            wraps.append(WRAPS.get(word, 10497))
-        turned, reader = np.eye(3), self._st(texture)
-        if reader is not None and reader.GetIdAttr().Get() == "UsdTransform2d":
-            inputs = (reader.GetInput(name) for name in ("scale", "rotation", "translation"))
-            scale, rotation, shift = (value.Get(FIRST) if value else None for value in inputs)
-            angle = math.radians(rotation or 0.0)  # counter-clockwise
-            turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-            turned[:2, :2], turned[:2, 2] = turn @ np.diag(scale or (1.0, 1.0)), shift or (0.0, 0.0)
-            reader = self._st(reader, "in")
-        if reader is not None and reader.GetInput("varname"):
-            self.uv_name = str(_produced(reader, "varname") or "st")
-        known = self.conversion.transforms.setdefault(self.material, turned)
-        if not np.array_equal(known, turned):
-            another = f"has a {name} with another UsdTransform2d than the first texture's"
-            self.conversion._leave(f"{another}, which is left out")
-        return {"wrapS": wraps[0], "wrapT": wraps[1]}
-
-    def _st(self, shader: Any, name: str = "st") -> Any:
-        prim = next((attribute.GetPrim() for attribute in _producing(shader, name)), shader.GetPrim())
-        return UsdShade.Shader(prim) if prim != shader.GetPrim() else None
-
 
 _TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
 
@@ -592,20 +372,21 @@ def _first(schema: Any, name: str) -> Any:
     return getattr(schema, f"Get{name}Attr")().Get(FIRST)
 
 
-def _producing(shader: Any, name: str) -> Sequence[Any]:
-    given = shader.GetInput(name)
-    return UsdShade.Utils.GetValueProducingAttributes(given) if given else ()
-
-
-def _produced(shader: Any, name: str) -> Any:
-    return next((attribute.Get(FIRST) for attribute in _producing(shader, name)), None)
-
-
 def _flattened(primvar: Any, width: int) -> tuple[Array, str] | None:
     """The values (N, width) of a primvar, and what each belongs to; None where there are none."""
     if not primvar or not primvar.HasValue():
         return None
     return _array(primvar.ComputeFlattened(FIRST), np.float64, width), str(primvar.GetInterpolation())
+
+
+def _primvar_values(primvars: Any, use: PrimvarUse | None) -> tuple[Array, str] | None:
+    """Return the values (N, C) of a primvar that a surface uses, and what each belongs to; else the fallback."""
+    if use is None:
+        return None
+    values = _flattened(primvars.FindPrimvarWithInheritance(use.name), len(use.fallback)) if use.name else None
+    if values is None or not len(values[0]):
+        return np.array([use.fallback]), "constant"
+    return np.nan_to_num(values[0]), values[1]
 
 
 def _array(values: Any, kind: Any, width: int = 0) -> Array:
