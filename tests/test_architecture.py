@@ -397,6 +397,7 @@ NOT_MESSAGES = (
     "advsearch.viewer.document",
     "advsearch.scene.importing.blender",
     "advsearch.scene.importing.files",
+    "advsearch.scene.importing.usd_layers",
 )
 """Modules that read or write flags themselves, also those of another program, and a style sheet."""
 

@@ -44,6 +44,16 @@ class Entry(BaseModel):
                 inside = held.values() if isinstance(held, dict) else held
                 level.extend(inner for inner in inside if isinstance(inner, Entry))
 
+    @classmethod
+    def read_of_extensions(cls) -> dict[str, set[str]]:
+        """Return the keys that are read of extensions, by their names; none where an extension is an entry itself."""
+        read: dict[str, set[str]] = {}
+        for info in cls.model_fields.values():
+            if isinstance(info.validation_alias, AliasPath):
+                path = [str(key) for key in info.validation_alias.path]
+                read.setdefault(path[1], set()).update(path[2:3])
+        return read
+
     def references(self) -> Iterator[tuple[str, int]]:
         for name, value in vars(self).items():
             level: list[Any] = [value] if name in REFERENCES else []

@@ -32,6 +32,7 @@ from advsearch.scene.importing.parts import (
 )
 from advsearch.scene.importing.pictures import FilePictures, Kind
 from advsearch.scene.importing.texture import mean_over
+from advsearch.scene.importing.unread import TrackedKeys
 from advsearch.scene.skeleton import Movable, Target
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -95,6 +96,7 @@ WORDS = {
     **dict.fromkeys(("TextureUse", "NormalUse"), "entry of a material's texture"),
     **{name: f"entry of a {name.lower()}" for name in ("Primitive", "Node", "Sampler", "Texture")},
     **{"MeshEntry": "entry of a mesh", "Image": "entry of an image", "LightEntry": "entry of a light"},
+    **{"TextureTransform": "entry of KHR_texture_transform"},
 }
 """What is left out of entries whose contents are seen."""
 PLAIN = frozenset(("name", "weights", "extensions"))
@@ -104,8 +106,15 @@ PLAIN = frozenset(("name", "weights", "extensions"))
 def _note_unread(header: Header, notes: Notes) -> None:
     for entry in header.entries():
         kind = WORDS.get(type(entry).__name__)
-        for key in (entry.model_extra or {}) if kind else ():
-            notes.has(str(kind), key)
+        if kind is None:
+            continue
+        keys = TrackedKeys(entry.model_extra or {})
+        extensions = keys.nested("extensions")
+        for name, read_keys in entry.read_of_extensions().items():
+            extensions.nested(name).mark_read(*(read_keys or (key for key, _ in extensions.nested(name).items())))
+        extensions.mark_read(*(name for name, _ in extensions.items()))  # others are named with the file's
+        for key in keys.unread():
+            notes.has(kind, key)
     for kind in set(WORDS.values()):
         for key in PLAIN if "material" in kind or "texture" in kind else {*PLAIN, "extras"}:  # notes of applications
             notes.take(kind, key)
@@ -113,6 +122,8 @@ def _note_unread(header: Header, notes: Notes) -> None:
         for primitive in mesh.primitives:
             material = None if primitive.material is None else header.materials[primitive.material]
             read = {"POSITION", "NORMAL", "COLOR_0", "TEXCOORD_0", material.attribute if material else ""}
+            packed = material.surface.metallicRoughnessTexture if material else None
+            read.add(packed.attribute if packed else "")
             for name in primitive.attributes:
                 is_of_skin = header.skins and name.startswith(("JOINTS_", "WEIGHTS_"))
                 if name not in read and not is_of_skin and not is_of_splats(name):
@@ -163,9 +174,9 @@ class GltfSurfaces:
     def __post_init__(self) -> None:
         self._pictures = FilePictures(len(self.file.header.materials), self.file.references, self.notes)
 
-    def surface(self, number: int | None, parts: Sequence[ImportedPart]) -> tuple[ImportedSurface, Doubles, Doubles]:
+    def surface(self, number: int | None, pieces: Sequence[_Piece]) -> tuple[ImportedSurface, Doubles, Doubles]:
         """Return the surface of a material (None: the format's default), and by what texture coordinates are scaled,
-        (2,), and shifted then, (2,), to fit its pictures; `parts` are all that have it, with the format's."""
+        (2,), and shifted then, (2,), to fit its pictures; `pieces` are all that have it, with the format's."""
         material = MaterialEntry() if number is None else self.file.header.materials[number]
         entry = material.surface
         scaled = np.array([1.0] * 4 if entry.baseColorFactor is None else entry.baseColorFactor, np.float32).clip(0, 1)
@@ -185,7 +196,7 @@ class GltfSurfaces:
         if alpha:
             cutoff = None if material.alphaMode == "BLEND" else material.alphaCutoff
             kept, texture = with_opacity(kept, scaled[3:], cutoff), with_opacity(texture, scaled[3:], cutoff)
-        roughness, metallic = self._roughness_and_metallic(material, parts)
+        roughness, metallic = self._roughness_and_metallic(material, pieces)
         normals = emission = None
         if material.normalTexture is not None and material.reads(material.normalTexture):
             normals = self._picture(material.normalTexture, "numbers", "the normal map {name} {why}; it is left out")
@@ -198,19 +209,19 @@ class GltfSurfaces:
                 emission = limited_radiance(glow, picture, self.notes)
         name = "" if number is None else material.name or f"material {number}"
         surface = ImportedSurface(kept, texture, unit(roughness), unit(metallic), normals, emission, name)
-        return self._fitted(surface, material, [part.uvs for part in parts if part.uvs is not None])
+        return self._fitted(surface, material, [piece.part.uvs for piece in pieces if piece.part.uvs is not None])
 
-    def _roughness_and_metallic(self, material: MaterialEntry, parts: Sequence[ImportedPart]) -> tuple[float, float]:
-        """The factors times the mean of their picture over the faces that show it; over all of it where it has other
-        coordinates than those that are read."""
+    def _roughness_and_metallic(self, material: MaterialEntry, pieces: Sequence[_Piece]) -> tuple[float, float]:
+        """The factors times the mean of their picture over the faces that show it; over all of it where they have no
+        coordinates."""
         entry, use = material.surface, material.surface.metallicRoughnessTexture
         packed = self._picture(use, "numbers", "the texture {name} of roughness and metallic {why}; it is left out")
         if packed is None or use is None:
             return entry.roughnessFactor, entry.metallicFactor
         self.notes.say("textures of roughness and metallic are replaced by their means")
-        mapped = [(part, part.uvs) for part in parts if part.uvs is not None]
+        mapped = [(piece.part, piece.packed_uvs) for piece in pieces if piece.packed_uvs is not None]
         mean = np.asarray(packed.mean(axis=(0, 1), dtype=np.float64), np.float32)
-        if mapped and use.looked_up_as(material.layout or TextureUse(index=0)):
+        if mapped:
             corners = np.concatenate([uvs[part.faces] * [1.0, -1.0] + [0.0, 1.0] for part, uvs in mapped])
             sides = face_vectors(np.concatenate([part.vertices[part.faces] for part, _ in mapped]))
             mean = mean_over(packed, corners, np.linalg.norm(sides, axis=1))
@@ -349,12 +360,13 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     for sentence in _counts({SEE_THROUGH: [True] * len(clear), DEFAULT: [True] * len(bare)}):
         notes.say(sentence)
     surfaces, finished = GltfSurfaces(file, notes), dict[tuple[int, int], ImportedPart]()
-    groups = dict[int | None, dict[tuple[int, int], ImportedPart]]()
+    groups = dict[int | None, dict[tuple[int, int], _Piece]]()
     for key, piece in with_faces.items():
-        groups.setdefault(piece.material, {})[key] = piece.part
+        groups.setdefault(piece.material, {})[key] = piece
     for material, group in groups.items():
         surface, scale, shift = surfaces.surface(material, list(group.values()))
-        for key, part in group.items():
+        for key, piece in group.items():
+            part = piece.part
             uvs = None if part.uvs is None else (part.uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
             finished[key] = replace(part, surface=surface, uvs=uvs)
     everywhere = dict(gltf_skeleton.poses(header.model_copy(update={"scenes": []})))
@@ -393,16 +405,15 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
 
 
 class _Piece(NamedTuple):
-    """A primitive as it is stored, without surface: its geometry, the number of its material, whether it has vertex
-    colours whose alpha would count, to which joints it is bound (None for none), its morph targets, and how far each
-    turns its normals. Its texture coordinates are the format's, v = 0 at the top."""
+    """A primitive as it is stored, without surface. Texture coordinates are the format's, v = 0 at the top."""
 
-    part: ImportedPart
+    part: ImportedPart  # its geometry
     material: int | None
-    see_through: bool
-    bound: gltf_skeleton.Bound | None
-    targets: tuple[Target, ...]
-    turns: tuple[Doubles | None, ...]
+    see_through: bool  # whether it has vertex colours whose alpha would count
+    bound: gltf_skeleton.Bound | None  # to which joints
+    targets: tuple[Target, ...]  # of morphing
+    turns: tuple[Doubles | None, ...]  # how far each target turns its normals
+    packed_uvs: Doubles | None  # (V, 2) of its texture of roughness and metallic
 
 
 def _piece(file: GltfFile, primitive: Primitive, extras: object, skinned: bool) -> _Piece | None:
@@ -419,15 +430,11 @@ def _piece(file: GltfFile, primitive: Primitive, extras: object, skinned: bool) 
     used, corners = np.unique(_triangles(order, primitive.mode), return_inverse=True)  # others may share the vertices
     faces, vertices = corners.reshape(-1, 3).astype(np.int64), file.numbers(held["POSITION"], used)
     material = MaterialEntry() if primitive.material is None else header.materials[primitive.material]
-    uvs = colors = None
+    colors = None
     see_through = False
-    if material.attribute in held:
-        uvs = file.numbers(held[material.attribute], used)
-        if material.layout is not None:
-            by = material.layout.transform
-            sine, cosine = np.sin(by.rotation), np.cos(by.rotation)
-            u, v = (uvs * by.scale).T
-            uvs = np.stack([cosine * u + sine * v, cosine * v - sine * u], axis=1) + by.offset
+    uvs = _coordinates(file, held, material.layout, used)
+    packed = material.surface.metallicRoughnessTexture
+    packed_uvs = None if packed is None else _coordinates(file, held, packed, used)
     if "COLOR_0" in held:
         rgba = np.clip(np.nan_to_num(file.numbers(held["COLOR_0"], used)), 0.0, 1.0)
         colors = rgba[:, :3][faces]
@@ -435,9 +442,25 @@ def _piece(file: GltfFile, primitive: Primitive, extras: object, skinned: bool) 
     normals = file.numbers(held["NORMAL"], used) if "NORMAL" in held else None
     part = ImportedPart(vertices, faces, normals, uvs, colors, ImportedSurface(), flat=True)
     joints = gltf_skeleton.bound(file, primitive, used) if skinned else None
-    return _Piece(
-        part, primitive.material, see_through, joints, *gltf_skeleton.targets_of(file, primitive, used, extras)
-    )
+    targets = gltf_skeleton.targets_of(file, primitive, used, extras)
+    return _Piece(part, primitive.material, see_through, joints, *targets, packed_uvs)
+
+
+def _coordinates(file: GltfFile, held: Mapping[str, int], use: TextureUse | None, used: Ints) -> Doubles | None:
+    """Return the texture coordinates (N, 2) by which a texture is looked up, (0, 0) at its top left corner."""
+    attribute = "TEXCOORD_0" if use is None else use.attribute
+    if attribute not in held:
+        return None
+    accessor = file.header.accessors[held[attribute]]
+    if accessor.type != "VEC2" or accessor.count != file.header.accessors[held["POSITION"]].count:
+        return None  # those of the base colour are checked with the header
+    uvs = file.numbers(held[attribute], used)
+    if use is None:
+        return uvs
+    by = use.transform
+    sine, cosine = np.sin(by.rotation), np.cos(by.rotation)
+    u, v = (uvs * by.scale).T
+    return np.asarray(np.stack([cosine * u + sine * v, cosine * v - sine * u], axis=1) + by.offset)
 
 
 def _triangles(order: Ints, mode: int) -> Ints:

@@ -24,9 +24,8 @@ from advsearch.scene.importing.parts import (
 )
 from advsearch.scene.importing.pictures import FilePictures, Kind
 from advsearch.scene.importing.texture import mean_over
+from advsearch.scene.importing.unread import TrackedKeys
 
-READ = frozenset("kd ke d tr pr pm map_kd map_ke map_d map_pr map_pm norm map_kn map_bump bump illum".split())
-"""Statements that become something, in lower case."""
 QUIET = frozenset("ka ks ns ni sharpness map_aat".split())
 """Statements of every file whose terms (ambient light, Phong's highlights) have no place in a physical material."""
 NORMALS = ("norm", "map_kn", "map_bump", "bump")
@@ -112,9 +111,9 @@ class MtlReader:
         return []
 
     def _look_of(self, material: MtlMaterial, square: int, name: str) -> Painted:
-        if not any(known == id(material) for known, _ in self._painted):
-            self._list(material)
+        is_first = not any(known == id(material) for known, _ in self._painted)
         uses = {key: use for key in (*PLACED, "map_pr", "map_pm") if (use := self._use(material, key)) is not None}
+        material.keys.mark_read("illum", *(key for key in uses if key not in NORMALS))
         if square:
             uses = {key: replace(use, name=named(use.name, square)) for key, use in uses.items()}
         first = next((uses[key] for key in PLACED if key in uses), MapUse("", {}))
@@ -122,6 +121,7 @@ class MtlReader:
             if (uses[key].scale, uses[key].offset) != (first.scale, first.offset):
                 what = f"{material.spelled[key]} of the material {shown(material.name)}"
                 self.notes.say(f"{what} lies elsewhere than its other maps (-s, -o); it is left out")
+                material.keys.mark_read(key)
                 del uses[key]
         rest, base, color = material.numbers("kd"), uses.get("map_kd"), None
         values = numbers_of(rest)
@@ -144,30 +144,36 @@ class MtlReader:
             self._see_through(material, uses.get("map_d"), ImportedSurface(color, texture, name=material.name)),
             roughness=self._share(material, "pr", uses.get("map_pr"), name, square),
             metallic=self._share(material, "pm", uses.get("map_pm"), name, square),
-            normal_map=self._bumps(uses),
+            normal_map=self._bumps(material, uses),
             emission=self._glow(material, uses.get("map_ke")),
         )
+        if is_first:
+            self._list(material)
         clamped = bool(first.name) and any(use.options.get("clamp", "").lower() == "on" for use in uses.values())
         return Painted(look, first.scale, first.offset, clamped)
 
     def _list(self, material: MtlMaterial) -> None:
         """Put what is not read into the inventory; what is there by default, and changes nothing, is not in it."""
-        said = {key: without_comment(rest) for key, rest in material.statements.items()}
-        zero = {key for key in said if not any(numbers_of(material.numbers(key)) or [1.0])}
+        zero = {key for key in material.statements if not any(numbers_of(material.peek_numbers(key)) or [1.0])}
+        base = map_of(without_comment(material.statements.get("map_kd", "")))
+
+        def is_quiet(key: str, statement: str) -> bool:
+            rest = without_comment(statement)
+            use = map_of(rest)
+            if not rest or key in QUIET or key in zero or (key == "pcr" and "pc" in zero):
+                return True
+            if key == "tf":
+                return len(set(rest.split())) == 1
+            return key == "map_ka" and use is not None and base is not None and use.name == base.name
+
         for key in material.again:
             self.notes.has("earlier material statement", key)
-        if len(material.numbers("kd").split()) == 4:
+        if len(material.peek_numbers("kd").split()) == 4:
             self.notes.has("fourth number of", material.spelled["kd"])
-        base = map_of(said.get("map_kd", ""))
-        for key, rest in said.items():
-            use = map_of(rest)
-            quiet = key in READ or key in QUIET or key in zero or (key == "pcr" and "pc" in zero)
-            quiet |= key == "tf" and len(set(rest.split())) == 1
-            quiet |= key == "map_ka" and use is not None and base is not None and use.name == base.name
-            if key == "illum" and material.numbers(key) not in ("", "0", "1", "2"):
-                self.notes.has("illumination model", rest)
-            elif not quiet:
-                self.notes.has("material statement", material.spelled[key])
+        if material.peek_numbers("illum") not in ("", "0", "1", "2"):
+            self.notes.has("illumination model", without_comment(material.statements["illum"]))
+        for name in material.keys.unread(is_quiet):
+            self.notes.has("material statement", name)
 
     def _use(self, material: MtlMaterial, key: str) -> MapUse | None:
         """Return what a statement says that names a picture, and put options that are not read into the inventory."""
@@ -180,15 +186,17 @@ class MtlReader:
         self._uses[id(material), key] = use
         taken = ("s", "o", "mm", "clamp", "bm" if key in NORMALS else "imfchan")
         colors = key in ("map_kd", "map_ke")
-        for option, value in {} if use is None else use.options.items():
+        options = TrackedKeys({} if use is None else use.options)
+        options.mark_read(*(option for option in taken if option != "imfchan" or not colors))
+
+        def is_quiet(option: str, value: str) -> bool:
             if option == "colorspace":
-                quiet = value.lower() == ("srgb" if colors else "linear")
-            elif option == "imfchan" and colors:
-                quiet = False
-            else:
-                quiet = option in taken or value.lower() == DEFAULTS.get(option) or not any(numbers_of(value) or [1.0])
-            if not quiet:
-                self.notes.has("texture option", f"-{option} of {material.spelled[key]}")
+                return value.lower() == ("srgb" if colors else "linear")
+            is_usual = value.lower() == DEFAULTS.get(option) or not any(numbers_of(value) or [1.0])
+            return is_usual and option != "imfchan"
+
+        for option in options.unread(is_quiet):
+            self.notes.has("texture option", f"-{option} of {material.spelled[key]}")
         return use
 
     def _see_through(self, material: MtlMaterial, use: MapUse | None, surface: ImportedSurface) -> ImportedSurface:
@@ -226,17 +234,18 @@ class MtlReader:
         where there is neither."""
         words = f"{material.spelled.get(f'map_{key}')} {{name}} {{why}}; it is left out"
         picture = self._picture(use, "numbers", words)
+        value = share_of(material.numbers(key), -1.0)
         if use is not None and picture is not None:
             self.notes.say("textures of roughness and metallic are replaced by their means")
             uvs, areas = self.shown_on(name, square)
             return float(mean_over(_channel(picture, use)[:, :, None], uvs * use.scale + use.offset, areas)[0])
-        value = share_of(material.numbers(key), -1.0)
         return value if value >= 0.0 else None
 
-    def _bumps(self, uses: dict[str, MapUse]) -> Floats | None:
+    def _bumps(self, material: MtlMaterial, uses: dict[str, MapUse]) -> Floats | None:
         words = "the normal map {name} {why}; it is left out"
         for key, use in ((key, uses[key]) for key in NORMALS if key in uses):
             picture = self._picture(use, "numbers", words)
+            material.keys.mark_read(*(other for other in uses if uses[other].name == use.name))
             if picture is not None:
                 if key in ("norm", "map_kn") or holds_normals(picture):
                     return normal_map(picture, use.bump)
@@ -368,8 +377,18 @@ class MtlMaterial:
     spelled: dict[str, str] = field(default_factory=dict)
     again: list[str] = field(default_factory=list)  # keywords of lines that others come after that say something else
 
+    @cached_property
+    def keys(self) -> TrackedKeys[str]:
+        """The statements, of which those that are read are recorded."""
+        return TrackedKeys({self.spelled[key]: rest for key, rest in self.statements.items()}, fold=str.lower)
+
     def numbers(self, key: str) -> str:
-        """Return what a statement of numbers says, without a comment; empty where there is none."""
+        """Read what a statement of numbers says, without a comment; empty where there is none."""
+        self.keys.mark_read(key)
+        return self.peek_numbers(key)
+
+    def peek_numbers(self, key: str) -> str:
+        """Return what `numbers` does, and do not count it as read."""
         return self.statements.get(key, "").partition("#")[0].strip()
 
 
