@@ -22,6 +22,7 @@ ENDINGS += [".bin"]
     ("ending", "what", "do"),
     [
         (".splat", "Gaussian splats", "fuse_post.ply"),
+        (".sog", "Gaussian splats", "fuse_post.ply"),
         (".fbx", "an FBX model", "bpy.ops.import_scene.fbx"),
         (".DAE", "a COLLADA model", "assimp export 'my thing.DAE' 'my thing.obj'"),
         (".3mf", "a 3MF model", "assimp export"),
@@ -84,6 +85,22 @@ def test_a_ply_of_splats_is_not_called_points(tmp_path: Path) -> None:
     )
     with pytest.raises(FileFormatError, match="got Gaussian splats, a model that has no surface"):
         import_object(path)
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
+        "property uint packed_position\nend_header\n0\n7\n"
+    )
+    with pytest.raises(FileFormatError, match="got Gaussian splats, a model that has no surface"):
+        import_object(path)
+
+
+def test_splats_beside_faces_are_named_first(tmp_path: Path) -> None:
+    path = tmp_path / "both.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "property float f_dc_0\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0 1\n1 0 0 1\n0 1 0 1\n3 0 1 2\n"
+    )
+    assert import_object(path).warnings[0].startswith("both.ply has Gaussian splats, which are left out: a model that")
 
 
 @pytest.mark.parametrize(

@@ -355,7 +355,8 @@ def test_display_colors_on_what_is_no_metal(tmp_path: Path, inputs: str) -> None
     (part,), notes = parts_of(write_stage(tmp_path, mesh=mesh))
     assert np.allclose(linear_color(part), 0.18 if inputs else (0.6, 0.05, 0.05), atol=0.001)
     assert (part.surface.metallic, part.surface.roughness) == (0.0, 0.5)
-    assert "glTF" not in notes and "metal" not in notes
+    color = " and displayColor: grey (0.18)" if inputs else ": of its displayColor"
+    assert f"without material{color}, with roughness 0.5 and no metal" in notes and "glTF" not in notes
 
 
 def test_display_colors_and_opacities_of_faces_and_vertices(tmp_path: Path) -> None:

@@ -331,6 +331,7 @@ SAID = {
     "disp -mm 0 2 high.png": "material statement 'disp' is left out",
     "decal sticker.png": "material statement 'decal' is left out",
     "refl -type sphere sky.png": "material statement 'refl' is left out",
+    "norm": "",
     "gloss_factor 3": "material statement 'gloss_factor' is left out",
     "Pr 0.5": "",
     "Ke 1 1 1": "",

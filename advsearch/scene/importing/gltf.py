@@ -156,7 +156,7 @@ def _needs(path: Path, names: Iterable[str]) -> FileFormatError:
 
 def unread_extensions(entry: Entry) -> list[str]:
     """Return the names of an entry's extensions that are not understood."""
-    held = (entry.model_extra or {}).get("extensions")
+    held = entry.extensions
     return sorted(name for name in held if name not in READ) if isinstance(held, dict) else []
 
 

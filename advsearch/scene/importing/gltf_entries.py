@@ -32,6 +32,7 @@ class Entry(BaseModel):
     """A JSON object of glTF; what it holds beyond the fields is kept as `model_extra`, to be named as left out."""
 
     model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False, frozen=True)
+    extensions: Unread = None  # as they are in the file
 
     def entries(self) -> Iterator[Entry]:
         """Yield this entry, and all that it consists of."""

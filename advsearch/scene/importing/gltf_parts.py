@@ -108,7 +108,7 @@ def _note_unread(header: Header, notes: Notes) -> None:
         kind = WORDS.get(type(entry).__name__)
         if kind is None:
             continue
-        keys = TrackedKeys(entry.model_extra or {})
+        keys = TrackedKeys({**(entry.model_extra or {}), "extensions": entry.extensions})
         extensions = keys.nested("extensions")
         for name, read_keys in entry.read_of_extensions().items():
             extensions.nested(name).mark_read(*(read_keys or (key for key, _ in extensions.nested(name).items())))

@@ -166,7 +166,11 @@ def read_ply(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     elements, comments = read_elements(data, notes)
     reader = _Properties(elements, notes)
     points = reader.columns("vertex", (("x", "y", "z"),))
+    if reader.has_splats:
+        notes.say(f" has Gaussian splats, which are left out: a model that {SPLATS}")
     if points is None:
+        if reader.has_splats:
+            raise FileFormatError(f"{path}: expected a mesh with faces, got Gaussian splats, a model that {SPLATS}")
         raise notes.damaged("a PLY file with vertices that have x, y and z", "none")
     corner, counts = reader.polygons(len(points))
     triangles, face = cut_up(points[corner], counts, notes)
@@ -204,6 +208,12 @@ class _Properties:
             elif element.count:
                 self.notes.has("element", element.name)
 
+    @property
+    def has_splats(self) -> bool:
+        """Whether vertices are Gaussian splats: as 3D Gaussian Splatting writes them, or packed by PlayCanvas."""
+        has = self.elements["vertex"].scalars if "vertex" in self.elements else {}
+        return "f_dc_0" in has or "packed_position" in has
+
     def columns(self, element: str, names: Sequence[tuple[str, ...]]) -> Doubles | None:
         """Return the values (N, C) of the first of several groups of properties that an element has; None for none."""
         group = self._known(element, "scalars", *names)
@@ -237,8 +247,8 @@ class _Properties:
             corners = np.concatenate([corners, triangles.reshape(-1)])
             counts = np.concatenate([counts, np.full(len(triangles), 3)])
         if (counts < 3).all():
-            splats = "f_dc_0" in self.elements["vertex"].scalars  # of 3D Gaussian splatting
-            what = f"Gaussian splats, a model that {SPLATS}" if splats else "points or lines only; export triangles"
+            points = "points or lines only; export triangles"
+            what = f"Gaussian splats, a model that {SPLATS}" if self.has_splats else points
             raise FileFormatError(f"{self.notes.path}: expected a mesh with faces, got {what}")
         self.notes.check_most(int(counts.max()), MOST_CORNERS, "faces with at most {} corners")
         self.notes.check_faces(int((counts - 2).clip(0).sum()))

@@ -292,6 +292,10 @@ class Conversion:
         if bound.color is None and bound.opacity is None:
             yield bound.number, None, faces
             return
+        if bound.is_default:
+            has_color = primvars.FindPrimvarWithInheritance("displayColor").HasValue()
+            color_words = ": of its displayColor" if has_color else " and displayColor: grey (0.18)"
+            self._leave(f"has a mesh without material{color_words}, with roughness 0.5 and no metal, as USD's default")
         colors, shares = (_primvar_values(primvars, use) for use in (bound.color, bound.opacity))
         start = np.cumsum(counts) - counts
 

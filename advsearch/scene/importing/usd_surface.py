@@ -93,6 +93,7 @@ class Bound:
     layouts: tuple[Layout, ...] = (Layout(),)  # texture coordinates by their numbers in glTF
     color: PrimvarUse | None = None
     opacity: PrimvarUse | None = None
+    is_default: bool = False  # whether it stands in for no material
 
 
 @dataclass
@@ -196,7 +197,7 @@ class Surfaces:
         surface = {"baseColorFactor": [*GREY, 1.0], "metallicFactor": 0.0, "roughnessFactor": ROUGHNESS}
         number = self._add_material({"name": "displayColor", "pbrMetallicRoughness": surface})
         color = PrimvarUse("displayColor", GREY)
-        return Bound(number, color=color, opacity=PrimvarUse("displayOpacity", (1.0,)))
+        return Bound(number, color=color, opacity=PrimvarUse("displayOpacity", (1.0,)), is_default=True)
 
     def _add_material(self, entry: dict[str, Any]) -> int:
         self.header["materials"].append({**entry, "doubleSided": True})
@@ -308,7 +309,9 @@ class PreviewSurface:
         self._emission(entry)
         if is_specular:
             self.surfaces.leave("has materials with a specular workflow, of which the diffuse colour is read")
-        shader.inputs.mark_read("opacityMode", "clearcoatRoughness")
+        shader.inputs.mark_read("clearcoatRoughness")  # named with the clearcoat
+        if str(shader.value("opacityMode") or "presence") != "presence" and entry.get("alphaMode") == "BLEND":
+            self.surfaces.leave("has materials with opacityMode transparent; here highlights fade with the opacity too")
         self._name_unread(is_specular=is_specular)
         number = self.surfaces._add_material(entry)
         return Bound(number, tuple(self.layouts) or (Layout(),), color, opacity)
