@@ -55,7 +55,7 @@ NO_SCALE, NO_BIAS = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.0)
 NORMAL_SCALE, NORMAL_BIAS = (2.0, 2.0, 2.0, 1.0), (-1.0, -1.0, -1.0, 0.0)
 """What makes normals of the texels of 8 bits."""
 UPRIGHT = (0.0, 0.0, 1.0)  # the normal of a surface that says none
-WITHOUT_EFFECT: Mapping[str, object] = {
+WITHOUT_EFFECT: Mapping[str, float | tuple[float, ...]] = {
     **{"clearcoat": 0.0, "displacement": 0.0, "occlusion": 1.0, "ior": 1.5},
     **{"specularColor": (0.0, 0.0, 0.0)},
 }
@@ -516,8 +516,9 @@ class PreviewSurface:
         size = max((plane.shape[1], plane.shape[0]) for plane in planes.values())
         packed = np.ones((size[1], size[0], 3), np.float32)
         for channel, name in ((1, "roughness"), (2, "metallic")):
-            plane = planes.get(name)
-            packed[:, :, channel] = min(max(factors[name], 0.0), 1.0) if plane is None else _resized(plane, size)
+            packed[:, :, channel] = min(max(factors[name], 0.0), 1.0)
+            if name in planes:
+                packed[:, :, channel] = _resized(planes[name], size)
         texture = self.surfaces.add_picture(packed, first.sampler)
         slot = self._slot(texture, first.layout)
         surface.update({"metallicFactor": 1.0, "roughnessFactor": 1.0, "metallicRoughnessTexture": slot})
