@@ -303,6 +303,19 @@ def test_transforms_in_a_row_and_of_one_texture_only(tmp_path: Path) -> None:
     assert "left out" not in notes
 
 
+def test_without_texture_coordinates_one_texel_is_shown(tmp_path: Path) -> None:
+    """The fallback of the reader, or the value of st, are on the red half."""
+    halves(tmp_path / "halves.png")
+    lost = reader("lost", "gone", more="float2 inputs:fallback = (0.5, 0.25)")
+    part, notes = part_of(tmp_path, COLOR, lost + texture("t", "halves.png", REPEAT, st="lost"))
+    assert "a mesh without the primvar 'gone' of a texture, of which one texel is shown" in notes
+    assert part.uvs is not None and np.allclose(part.uvs, [0.5, 0.25])
+    still = texture("t", "halves.png", REPEAT + "\nfloat2 inputs:st = (0.1, 0.2)", st="")
+    part, notes = part_of(tmp_path, COLOR, still)
+    assert "a texture without texture coordinates (st), of which one texel is shown" in notes
+    assert part.uvs is not None and np.allclose(part.uvs, [0.1, 0.2])
+
+
 def test_normal_maps_by_their_scale_and_bias(tmp_path: Path) -> None:
     """Also with y down, without both, and in floats as they are."""
     save(tmp_path / "n.png", np.full((4, 4, 3), (128, 178, 246)))

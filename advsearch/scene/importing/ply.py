@@ -247,8 +247,9 @@ class _Properties:
             corners = np.concatenate([corners, triangles.reshape(-1)])
             counts = np.concatenate([counts, np.full(len(triangles), 3)])
         if (counts < 3).all():
-            points = "points or lines only; export triangles"
-            what = f"Gaussian splats, a model that {SPLATS}" if self.has_splats else points
+            what = "points or lines only; export triangles"
+            if self.has_splats:
+                what = f"Gaussian splats, a model that {SPLATS}"
             raise FileFormatError(f"{self.notes.path}: expected a mesh with faces, got {what}")
         self.notes.check_most(int(counts.max()), MOST_CORNERS, "faces with at most {} corners")
         self.notes.check_faces(int((counts - 2).clip(0).sum()))
