@@ -101,7 +101,8 @@ class PathControl(Control):
                "How far it goes, in distances of the scene's own camera: where approach begins, half of what pass "
                "takes.", most=1000.0),
         Choice("shutter", None, "Seconds that each row is exposed: motion blur.", "shutter", most=60.0),
-        Choice("rolling", None, "Seconds in which the rows are read, one after the other.", "rolling", most=60.0),
+        Choice("rolling", None, "Seconds in which the rows are read, one after the other; below 0 from the bottom.",
+               "rolling", most=60.0, signed=True),
     )  # fmt: skip
 
     @classmethod
@@ -153,7 +154,7 @@ class PathControl(Control):
 
     @property
     def exposure(self) -> tuple[float, float]:  # type: ignore[override]
-        """Seconds that the shutter is open, and that rows are read in."""
+        """Seconds that the shutter is open, and that rows are read in, below 0 from the bottom."""
         return float(self.chosen["shutter"] or 0.0), float(self.chosen["rolling"] or 0.0)
 
     def later(self, seconds: float) -> PathControl:

@@ -139,8 +139,8 @@ class AttackConfig(DerivativeConfig):
         unit="seconds", gt=0.0, le=60.0,
     )
     rolling: float | None = setting(
-        None, "search", "how long the rows of a picture are read one after the other along a path (rolling shutter)",
-        otherwise="all at once", unit="seconds", gt=0.0, le=60.0,
+        None, "search", "how long the rows of a picture are read one after the other along a path (rolling shutter), from the top; "
+        "below 0 from the bottom", otherwise="all at once", unit="seconds", ge=-60.0, le=60.0,
     )
     draws: int | None = setting(
         None, "search", "how many random conditions each step looks at, with --over",
