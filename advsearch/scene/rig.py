@@ -176,7 +176,9 @@ def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
         turn = np.reshape(numbers, (-1, 4))[:3, :3]
         turn_scale = abs(float(np.linalg.det(turn))) ** (1.0 / 3.0)
         if not np.allclose(turn @ turn.T, turn_scale**2 * np.eye(3), atol=1e-3 * turn_scale**2):
-            raise FileFormatError(f"{path}: applied_transform: expected a rotation, a shift and a scale, got another map")
+            raise FileFormatError(
+                f"{path}: applied_transform: expected a rotation, a shift and a scale, got another map"
+            )
         scale *= turn_scale
     if not SMALLEST_SCALE <= scale <= 1.0 / SMALLEST_SCALE:
         wanted = f"from {SMALLEST_SCALE:g} to {1.0 / SMALLEST_SCALE:g}"

@@ -42,7 +42,9 @@ def levels(radiance: Tensor, like: Renderer) -> Tensor:
 
 
 @pytest.mark.parametrize("count", [1, 5, 16])
-@pytest.mark.parametrize(("shutter", "rolling"), [(0.1, 0.0), (0.0, 0.1), (0.03, 0.1), (0.1, 0.03), (0.0, -0.1), (0.03, -0.1)])
+@pytest.mark.parametrize(
+    ("shutter", "rolling"), [(0.1, 0.0), (0.0, 0.1), (0.03, 0.1), (0.1, 0.03), (0.0, -0.1), (0.03, -0.1)]
+)
 def test_every_row_is_exposed_around_its_own_time_and_as_long(shutter: float, rolling: float, count: int) -> None:
     offsets, rows, samples = moments_of(shutter, rolling, 20, count)
     torch.testing.assert_close(rows.sum(dim=0), torch.ones(20))

@@ -130,7 +130,7 @@ class AttackConfig(DerivativeConfig):
         None, "search",
         "the path along which camera or object travel, with --over path; pictures of the adversarial scene along it "
         "are kept",
-        "approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in approach+orbit; of "
+        "approach, pass, orbit, a .csv file or a trajectory (TUM, EuRoC, KITTI), or two of them, the camera's and the object's, as in approach+orbit; of "
         "several with commas between them, one is drawn each time",
         otherwise="approach", min_length=1,
     )

@@ -1,0 +1,113 @@
+"""Values of a file by their keys: which keys were read is recorded, and the rest is named.
+
+Every reader of a format with keys uses this, so that nothing in a file is left out without a word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Generic, TypeVar
+
+from advsearch.scene.importing.files import shown
+
+MAX_NAMED = 12  # keys that one message names
+
+T = TypeVar("T")
+
+
+class TrackedKeys(Generic[T]):
+    """Read values by key, and list the keys that were not read.
+
+        entries = TrackedKeys({"Fl-X": 500.0, "k7": 0.1}, fold=plain)
+        entries.get("flx", "fx")        # 500.0: the value of the first of these keys that has one
+        entries.unread()                # ["k7"], as the file spells it
+        join_names(entries.unread())    # "'k7'": bounded in length, for a message
+
+    `fold` turns a key into the form by which it is looked up, such as ``str.lower``. Of keys with
+    the same form the last counts; the earlier ones are in `repeated`.
+    """
+
+    def __init__(self, values: Mapping[str, T], *, fold: Callable[[str], str] = str, within: str = "") -> None:
+        self.repeated: list[str] = []  # keys, as spelled, that a later one of the same form hides
+        self._fold = fold
+        self._within = within
+        self._values: dict[str, T] = {}
+        self._spelling: dict[str, str] = {}
+        self._read: set[str] = set()
+        self._nested: dict[str, TrackedKeys[Any]] = {}
+        for key, value in values.items():
+            folded = fold(key)
+            if folded in self._spelling:
+                self.repeated.append(self._spelling[folded])
+            self._values[folded] = value
+            self._spelling[folded] = key
+
+    def get(self, *keys: str) -> T | None:
+        """Return the value of the first of these keys, in folded form, that has one, or None.
+
+        That key counts as read, and so do those of the others that have no value (None).
+        """
+        present = [key for key in keys if self._values.get(key) is not None]
+        self._read.update(key for key in keys if key not in present[1:])
+        return self._values[present[0]] if present else None
+
+    def peek(self, key: str) -> T | None:
+        """Return a value without counting its key as read."""
+        return self._values.get(key)
+
+    def mark_read(self, *keys: str) -> None:
+        """Count keys, in folded form, as read."""
+        self._read.update(keys)
+
+    def nested(self, key: str) -> TrackedKeys[Any]:
+        """Return the keys within the value of a key; what is not read of them is not read of this.
+
+        It has no keys where there is no such value. A value that is no mapping stays unread.
+        """
+        if key not in self._nested:
+            value = self._values.get(key)
+            inner: dict[str, Any] = {}
+            if isinstance(value, Mapping):
+                self._read.add(key)
+                inner = {str(name): held for name, held in value.items()}
+            spelled = self._spelling.get(key, key)
+            self._nested[key] = TrackedKeys(inner, fold=self._fold, within=f"{self._within}{spelled}.")
+        return self._nested[key]
+
+    def unread(self, is_quiet: Callable[[str, T], bool] | None = None) -> list[str]:
+        """Return the keys that were not read, as spelled, each with the keys that it is within.
+
+        Args:
+            is_quiet: whether a key, in folded form, with its value needs no word, because it
+                changes nothing. It does not judge nested keys.
+        """
+        names = []
+        for key, spelled in self._spelling.items():
+            quiet = is_quiet is not None and is_quiet(key, self._values[key])
+            if key not in self._read and not quiet:
+                names.append(self._within + spelled)
+            if key in self._nested:
+                names += self._nested[key].unread()
+        return names
+
+    def spelled(self, key: str) -> str:
+        """Return a key, in folded form, as the file spells it, or as it is if it has none."""
+        return self._spelling.get(key, key)
+
+    def items(self) -> Iterator[tuple[str, T]]:
+        """Yield folded keys and values, and count none as read."""
+        yield from self._values.items()
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._values
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+
+def join_names(names: Iterable[str], max_named: int = MAX_NAMED) -> str:
+    """Return names out of a file for a message: quoted, cut in length, and the rest as a number."""
+    listed = list(dict.fromkeys(names))
+    text = ", ".join(shown(name) for name in listed[:max_named])
+    rest = len(listed) - max_named
+    return f"{text} and {rest:,} more" if rest > 0 else text
