@@ -159,12 +159,8 @@ class PathControl(Control):
         self._files = [way for way in every if isinstance(way, Waypoints)]
         if "moves" in self._given and not any(len(one.split(BOTH)) == 1 for one in names):
             raise InputError(f"{self.name}: {names[0]} says what the camera does and what the object; leave moves out")
-        needless = [name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None]
-        if needless and not any(way.is_trajectory for way in self._files):
-            raise InputError(
-                f"{self.name}: {needless[0]}: is about a trajectory of TUM, EuRoC or KITTI, and there is none; "
-                "leave it out"
-            )
+        if "path" in self._given:  # otherwise the run may say it, later
+            self._check_needless()
         timed = any(way.has_times for way in self._files)
         for setting, said in (("seconds", timed), ("reach", len(self._files) == len(every))):
             if said and setting in self._given:
@@ -187,6 +183,15 @@ class PathControl(Control):
         for mover, part in zip([str(self.chosen["moves"])] if alone else MOVERS, names, strict=True):
             ways |= {mover: part} if part in PATHS else self._read_file(Path(part), mover, alone)
         return ways
+
+    def _check_needless(self) -> None:
+        """Refuse what is about trajectories where there is none."""
+        needless = [name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None]
+        if needless and not any(way.is_trajectory for way in self._files):
+            raise InputError(
+                f"{self.name}: {needless[0]}: is about a trajectory of TUM, EuRoC or KITTI, and there is none; "
+                "leave it out"
+            )
 
     def _check_object_at(self) -> None:
         given = self.chosen["object_at"]
@@ -289,6 +294,7 @@ class PathControl(Control):
                 f"`controls` {self.name}: moves the camera, and the scene is seen by its camera {scene.camera!r}; give "
                 f"moves=object, or have it seen by {ORBIT_CAMERA!r}"
             )
+        self._check_needless()
         there = self.within(scene)
         for name, ways in zip(_names(self.chosen["path"]), self._paths, strict=True):
             if CAMERA in ways:

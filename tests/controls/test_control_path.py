@@ -549,6 +549,8 @@ def test_settings_of_trajectories_are_checked(tmp_path: Path) -> None:
     file.write_text(trajectory("tum"))
     with pytest.raises(InputError, match="axes: is about a trajectory"):
         PathControl(path="orbit", axes="flu")
+    with pytest.raises(InputError, match="axes: is about a trajectory"):
+        PathControl(axes="flu").prepare(describe("mug", size=1.0))
     for given in ([1, 2], "here", [1, 2, math.nan], [1, 2, "3"]):
         with pytest.raises(InputError, match="object_at: expected three numbers"):
             PathControl(path=str(file), object_at=given)
