@@ -292,9 +292,9 @@ def _edges(size: int, count: int) -> Ints:
 # When the rows of a picture are exposed: an open shutter (motion blur) and rows that are read one after the other.
 #
 # A row r of H is exposed for `shutter` seconds, and rows are read within `rolling` seconds, the first at the top, or at
-# the bottom where that is below 0; the middle of the picture's exposure is the time of the configuration. What a sensor counts is light, so a row is the mean of linear radiance over
-# its exposure, before the denoiser and the tone curve. The mean is over M moments, evenly spaced, of which each row
-# takes those in its own exposure.
+# the bottom where that is below 0; the middle of the picture's exposure is the time of the configuration. What
+# a sensor counts is light, so a row is the mean of linear radiance over its exposure, before the denoiser and the tone
+# curve. The mean is over M moments, evenly spaced, of which each row takes those in its own exposure.
 
 FEWEST, MOST = 8, 64
 A_PIXEL = 2  # moments for each pixel that the fastest point of the picture moves while it is taken
