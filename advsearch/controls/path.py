@@ -24,7 +24,14 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named
 from advsearch.controls.pose import euler
-from advsearch.controls.pose_files import (
+from advsearch.controls.ranges import OneOf, Spec, is_number
+from advsearch.errors import FileFormatError, InputError
+from advsearch.files import PATH_ENDINGS, read_text
+from advsearch.options import rounded
+from advsearch.scene.assets import Doubles
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import affine, camera_to_world, middle, object_to_world
+from advsearch.scene.pose_files import (
     AXES_MEAN,
     KITTI_RATE,
     OPTICAL,
@@ -34,13 +41,6 @@ from advsearch.controls.pose_files import (
     Trajectory,
     read_trajectory,
 )
-from advsearch.controls.ranges import OneOf, Spec, is_number
-from advsearch.errors import FileFormatError, InputError
-from advsearch.files import PATH_ENDINGS, read_text
-from advsearch.options import rounded
-from advsearch.scene.assets import Doubles
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import affine, camera_to_world, middle, object_to_world
 from advsearch.scene.settings import GEOMETRIC, ORBIT, ORBIT_CAMERA, moving
 from advsearch.scene.skeleton import entries_of_turn
 
@@ -93,7 +93,7 @@ class Waypoints:
         quaternion = self.at(time, self.rotations)
         quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(1e-9)
         entries = torch.stack(entries_of_turn(*quaternion.unbind(dim=-1)), dim=-1)
-        return entries.unflatten(-1, (3, 3))
+        return entries.reshape(*entries.shape[:-1], 3, 3)
 
 
 class Start(NamedTuple):

@@ -137,11 +137,10 @@ def translate_entries(path: str, which: str, data: Mapping[str, Any]) -> dict[st
         return None
     stella = data.get("Camera")
     if isinstance(stella, dict) and "model" in stella:
-        entries = {STELLA_NAMES.get(name, name): value for name, value in stella.items()}
+        entries = {STELLA_NAMES.get(str(name), str(name)): value for name, value in stella.items()}
         kind = str(stella["model"])
         entries["distortion_model"] = STELLA_KINDS.get(kind, kind)
-        kept = {name: value for name, value in entries.items() if not ORBSLAM_OF_NO_LENS.fullmatch(f"Camera.{name}")}
-        return kept
+        return {name: value for name, value in entries.items() if not ORBSLAM_OF_NO_LENS.fullmatch(f"Camera.{name}")}
     if "ppx" in data:
         return _translate_realsense(data)
     if data.get("projection") in METASHAPE_KINDS or ("projection" in data and "f" in data):
