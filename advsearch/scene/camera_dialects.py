@@ -165,10 +165,13 @@ def _translate_orbslam(path: str, which: str, data: Mapping[str, Any], cameras: 
 
 
 def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
-    """Return the entries with the matrices of KITTI's cameras, by the cameras' names."""
+    """Return the entries with the matrices of KITTI's cameras, by the cameras' names.
+
+    Its numbers have blanks between them, and so are text; a list is the P1 of a stereo pair of OpenCV's.
+    """
     cameras = dict[str, str]()
     for name, value in data.items():
-        if not isinstance(value, (str, list)):
+        if not isinstance(value, str):
             continue
         if KITTI_PROJECTION.fullmatch(name):
             cameras[name] = name
@@ -178,10 +181,9 @@ def _find_kitti(data: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _read_numbers(path: str, data: Mapping[str, Any], name: str, count: int) -> list[float]:
-    given = data.get(name)
-    words = given.split() if isinstance(given, str) else given
-    if not isinstance(words, list) or len(words) != count:
-        raise FileFormatError(f"{path}: {name}: expected {count} numbers, got {shown(str(given))}")
+    words = str(data.get(name, "")).split()
+    if len(words) != count:
+        raise FileFormatError(f"{path}: {name}: expected {count} numbers, got {shown(' '.join(words) or 'nothing')}")
     return [number(path, name, word) for word in words]
 
 
