@@ -183,10 +183,14 @@ def _check(path: Path, status: os.stat_result, expected: str, limit: int) -> Non
         raise too_large(path, f"{expected} of at most {scaled(limit):,} bytes", f"{status.st_size:,}")
 
 
+PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")
+"""How the name of a file ends along which something travels, in small letters."""
+
+
 def split_paths(name: str) -> list[str]:
     """Return both parts of ``camera.csv+object.csv``, ``approach+object.csv`` or ``camera.csv+orbit``, the path of the
     camera and that of the object; any other name as it is."""
     first, _, second = name.partition("+")
-    camera, thing = (one.lower().endswith(".csv") for one in (first, second))
+    camera, thing = (one.lower().endswith(PATH_ENDINGS) for one in (first, second))
     both = second and (camera or (thing and "/" not in first)) and not os.path.isfile(name)
     return [first, second] if both else [name]

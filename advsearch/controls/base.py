@@ -127,6 +127,7 @@ class Choice:
         options: the names that can be chosen; empty for anything else.
         whole: the smallest and the largest whole number that can be chosen, or None.
         most: the largest number that can be chosen, all over 0; None for anything else.
+        signed: numbers down to minus `most` can be chosen, too.
     """
 
     name: str
@@ -138,6 +139,7 @@ class Choice:
     options: tuple[str, ...] = ()
     whole: tuple[int, int] | None = None
     most: float | None = None
+    signed: bool = False
 
     def check(self, control: str, given: object) -> None:
         """Check what was chosen in an instance of a control; None is fine where it is the default. Raises InputError:
@@ -149,6 +151,9 @@ class Choice:
             low, high = self.whole
             allowed = f"a whole number from {low} to {high}"
             fits = is_number(given) and low <= given <= high and given == int(given)
+        elif self.most is not None and self.signed:
+            allowed = f"a number from {-self.most:g} to {self.most:g}"
+            fits = is_number(given) and abs(given) <= self.most
         elif self.most is not None:
             allowed, fits = f"a number over 0 and up to {self.most:g}", is_number(given) and 0.0 < given <= self.most
         if not fits and not (given is None and self.default is None):
@@ -191,8 +196,8 @@ class Control:
         refines: the scene inputs that it takes from the controls before it, and may change (a patch on a texture).
         on_top: what it refines lies over what all other controls make of it, whatever the order in which they were
             asked for (a patch on any material).
-        exposure: seconds that the shutter is open, and that the rows of a picture are read in; see
-            `advsearch.scene.formation`.
+        exposure: seconds that the shutter is open, and that the rows of a picture are read in, below 0 from the bottom;
+            see `advsearch.scene.formation`.
         flashes: how often a second it changes its light at most.
 
     Raises:

@@ -19,18 +19,30 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named
 from advsearch.controls.pose import euler
-from advsearch.controls.ranges import OneOf, Spec
+from advsearch.controls.ranges import OneOf, Spec, is_number
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import read_text
+from advsearch.files import PATH_ENDINGS, read_text
 from advsearch.options import rounded
 from advsearch.scene.assets import Doubles
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import affine, camera_to_world, middle, object_to_world
+from advsearch.scene.pose_files import (
+    AXES_MEAN,
+    KITTI_RATE,
+    OPTICAL,
+    UNUSED,
+    WORLD_TO_Z_UP,
+    PoseFormat,
+    Trajectory,
+    read_trajectory,
+)
 from advsearch.scene.settings import GEOMETRIC, ORBIT, ORBIT_CAMERA, moving
+from advsearch.scene.skeleton import entries_of_turn
 
 APPROACH, PASS, TURN = "approach", "pass", "orbit"
 PATHS = (APPROACH, PASS, TURN)
@@ -49,6 +61,8 @@ TIME, PLACE, LOOKING, HEADING = "time", ("x", "y", "z"), ("look_x", "look_y", "l
 SHIFT, TURNING = ("object_x", "object_y", "object_z"), "object_heading"
 """Columns of the object in a file that is about both."""
 MOST_WAYPOINTS, MOST_BYTES = 100_000, 16 * 2**20
+TRAJECTORY_CHOICES = ("axes", "up", "object_at")
+MAX_TILT = 60.0  # degrees from up, on average, over which other axes are likelier
 FARTHEST = 1e5  # metres, or object sizes, that a waypoint may be away
 
 
@@ -60,6 +74,10 @@ class Waypoints:
     places: Tensor  # (n, 3) from the middle of where the object stands; of an object that moves, its shift
     targets: Tensor | None  # (n, 3) what the camera looks at, from the same middle; None for the middle itself
     headings: Tensor | None  # (n,) degrees that the object is turned by; None for none
+    # (n, 4) quaternions x, y, z, w from the camera's axes (x right, y down, z ahead); None where it looks at targets
+    rotations: Tensor | None = None
+    has_times: bool = True
+    is_trajectory: bool = False
     notes: tuple[str, ...] = ()  # sentences about how it is read
 
     def at(self, time: Tensor, of: Tensor) -> Tensor:
@@ -68,6 +86,14 @@ class Waypoints:
         begin, end = self.times[place - 1], self.times[place]
         share = ((time - begin) / (end - begin)).clamp(0.0, 1.0)
         return torch.lerp(of[place - 1], of[place], share[..., None] if of.ndim > 1 else share)
+
+    def rotation_at(self, time: Tensor) -> Tensor:
+        """Return the rotation (..., 3, 3) at times (...,): its columns are the camera's right, down and ahead."""
+        assert self.rotations is not None
+        quaternion = self.at(time, self.rotations)
+        quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+        entries = torch.stack(entries_of_turn(*quaternion.unbind(dim=-1)), dim=-1)
+        return entries.reshape(*entries.shape[:-1], 3, 3)
 
 
 class Start(NamedTuple):
@@ -92,16 +118,26 @@ class PathControl(Control):
     )
     choices = (
         Choice("path", APPROACH,
-               "approach (straight up to where it stands), pass (straight past it), orbit (once around), or a .csv "
-               "file with columns time, x, y, z. Two of them with a + between: the camera's and the object's. Several "
-               "with commas between: each configuration has one of them, `way`.", "path"),
+               "approach (straight up to where it stands), pass (straight past it), orbit (once around), a .csv file "
+               "with columns time, x, y, z, or a trajectory of TUM, EuRoC or KITTI. Two of them with a + between: the "
+               "camera's and the object's. Several with commas between: each configuration has one of them, `way`.",
+               "path"),
         Choice("moves", CAMERA, "What travels along a single path: camera or object.", options=MOVERS),
-        Choice("seconds", SECONDS, "How long it takes; a file says so itself.", most=LONGEST),
+        Choice("seconds", SECONDS, "How long it takes; a file says so itself, but for KITTI's poses.", most=LONGEST),
         Choice("reach", REACH,
                "How far it goes, in distances of the scene's own camera: where approach begins, half of what pass "
                "takes.", most=1000.0),
         Choice("shutter", None, "Seconds that each row is exposed: motion blur.", "shutter", most=60.0),
-        Choice("rolling", None, "Seconds in which the rows are read, one after the other.", "rolling", most=60.0),
+        Choice("rolling", None, "Seconds in which the rows are read, one after the other; below 0 from the bottom.",
+               "rolling", most=60.0, signed=True),
+        Choice("axes", None,
+               "The axes of a trajectory's poses: optical (x right, y down, z ahead), opengl (x right, y up, z back), "
+               "flu (x ahead, y left, z up), frd (x ahead, y right, z down), euroc (x up, y right, z ahead), or none: "
+               "the camera looks at the object. By default optical.", options=tuple(AXES_MEAN)),
+        Choice("up", None, "What is up in a trajectory's world; by default z, of KITTI -y.",
+               options=tuple(WORLD_TO_Z_UP)),
+        Choice("object_at", None, "Where the object's middle is in a trajectory's world, as [x, y, z]; by default its "
+               "origin."),
     )  # fmt: skip
 
     @classmethod
@@ -116,13 +152,17 @@ class PathControl(Control):
         names = _names(self.chosen["path"])
         if len(set(names)) < len(names) or len(names) > MOST_PATHS:
             raise InputError(f"{self.name}.path: expected at most {MOST_PATHS} different paths, got {', '.join(names)}")
+        self._check_object_at()
         self._paths: tuple[Ways, ...] = tuple(map(self._read, names))
         self._movers = {mover for ways in self._paths for mover in ways}
         every = [way for ways in self._paths for way in ways.values()]
         self._files = [way for way in every if isinstance(way, Waypoints)]
         if "moves" in self._given and not any(len(one.split(BOTH)) == 1 for one in names):
             raise InputError(f"{self.name}: {names[0]} says what the camera does and what the object; leave moves out")
-        for setting, said in (("seconds", bool(self._files)), ("reach", len(self._files) == len(every))):
+        if "path" in self._given:  # otherwise the run may say it, later
+            self._check_needless()
+        timed = any(way.has_times for way in self._files)
+        for setting, said in (("seconds", timed), ("reach", len(self._files) == len(every))):
             if said and setting in self._given:
                 asked = self.chosen["path"]
                 raise InputError(f"{self.name}: {setting}: the file in {asked} says that itself; leave it out")
@@ -136,13 +176,100 @@ class PathControl(Control):
         alone = len(names) == 1
         if alone and not _is_path(name):
             raise InputError(
-                f"{self.name}.path: expected {', '.join(PATHS)}, a .csv file, or two of them as in "
-                f"{APPROACH}{BOTH}{TURN}, the camera's and the object's, got {name!r}"
+                f"{self.name}.path: expected {', '.join(PATHS)}, a {' or '.join(PATH_ENDINGS)} file, or two of them as "
+                f"in {APPROACH}{BOTH}{TURN}, the camera's and the object's, got {name!r}"
             )
         ways: dict[str, Way] = {}
         for mover, part in zip([str(self.chosen["moves"])] if alone else MOVERS, names, strict=True):
-            ways |= {mover: part} if part in PATHS else read_waypoints(Path(part), mover, alone=alone)
+            ways |= {mover: part} if part in PATHS else self._read_file(Path(part), mover, alone)
         return ways
+
+    def _check_needless(self) -> None:
+        """Refuse what is about trajectories where there is none."""
+        needless = [name for name in TRAJECTORY_CHOICES if self.chosen[name] is not None]
+        if needless and not any(way.is_trajectory for way in self._files):
+            raise InputError(
+                f"{self.name}: {needless[0]}: is about a trajectory of TUM, EuRoC or KITTI, and there is none; "
+                "leave it out"
+            )
+
+    def _check_object_at(self) -> None:
+        given = self.chosen["object_at"]
+        if given is None:
+            return
+        fits = isinstance(given, list | tuple) and len(given) == 3
+        if not fits or not all(is_number(value) and math.isfinite(value) for value in given):
+            raise InputError(f"{self.name}.object_at: expected three numbers as in [20, 0, 0], got {given!r}")
+
+    def _read_file(self, path: Path, mover: str, alone: bool) -> Ways:
+        text = _read_text(path)
+        trajectory = read_trajectory(path, text)
+        if trajectory is None:
+            return read_waypoints(path, mover, text=text, alone=alone)
+        if mover != CAMERA:
+            raise FileFormatError(
+                f"{path}: {trajectory.format.value} is about the camera, and here the object moves; write its way as "
+                "time,x,y,z,heading"
+            )
+        return {mover: self._follow(path, trajectory)}
+
+    def _follow(self, path: Path, trajectory: Trajectory) -> Waypoints:
+        """Return the way of the camera on a trajectory, with notes on what its file does not state."""
+        count = len(trajectory.positions)
+        notes = list(trajectory.notes)
+        assumed = dict[str, str]()
+        times = trajectory.times
+        if times is None:
+            seconds = (count - 1) / KITTI_RATE
+            if "seconds" in self._given:
+                seconds = float(self.chosen["seconds"])
+            else:
+                assumed["seconds"] = f"{KITTI_RATE:g} poses a second, {rounded(seconds)} in all"
+            times = np.linspace(0.0, seconds, count)
+        check_times(path, times)
+
+        axes = str(self.chosen["axes"] or OPTICAL)
+        up = str(self.chosen["up"] or trajectory.default_up)
+        origin = self.chosen["object_at"] or (0.0, 0.0, 0.0)
+        if trajectory.rotations is None and axes == UNUSED:
+            raise InputError(f"{self.name}: axes: {path} has no rotations; leave it out")
+        if self.chosen["axes"] is None and trajectory.rotations is not None:
+            assumed["axes"] = f"{axes} ({AXES_MEAN[axes]})"
+        if self.chosen["up"] is None:
+            assumed["up"] = up
+        if self.chosen["object_at"] is None:
+            assumed["object_at"] = "[0, 0, 0]"
+        positions, rotations = trajectory.orient(axes, up, origin)
+        if np.abs(positions).max() > FARTHEST:
+            raise FileFormatError(
+                f"{path}: expected positions within {FARTHEST:g} of the object, got larger ones; object_at says where "
+                "that is in the file's world"
+            )
+        if assumed:
+            listed = ", ".join(f"{name} {value}" for name, value in assumed.items())
+            notes.append(
+                f"{path}: {trajectory.format.value} does not state everything. Assumed: {listed}. If that is wrong, "
+                f"say {', '.join(assumed)} of the control path; with axes none the camera looks at the object."
+            )
+        quaternions = None
+        if rotations is not None:
+            tilt = measure_tilt(rotations)
+            if tilt > MAX_TILT:
+                notes.append(
+                    f"{path}: the top of its pictures is {tilt:.0f} degrees from up, on average; another `axes` or "
+                    "`up` may be right."
+                )
+            quaternions = torch.from_numpy(align_quaternions(rotations.as_quat()).astype(np.float32))
+        return Waypoints(
+            torch.from_numpy(times.astype(np.float32)),
+            torch.from_numpy(positions.astype(np.float32)),
+            None,
+            None,
+            rotations=quaternions,
+            has_times=trajectory.format is not PoseFormat.KITTI,
+            is_trajectory=True,
+            notes=tuple(notes),
+        )
 
     def spec(self, parameter: Parameter) -> Spec:
         if parameter.name == WAY and WAY not in self.specs:  # whatever else is asked for
@@ -153,7 +280,7 @@ class PathControl(Control):
 
     @property
     def exposure(self) -> tuple[float, float]:  # type: ignore[override]
-        """Seconds that the shutter is open, and that rows are read in."""
+        """Seconds that the shutter is open, and that rows are read in, below 0 from the bottom."""
         return float(self.chosen["shutter"] or 0.0), float(self.chosen["rolling"] or 0.0)
 
     def later(self, seconds: float) -> PathControl:
@@ -167,6 +294,7 @@ class PathControl(Control):
                 f"`controls` {self.name}: moves the camera, and the scene is seen by its camera {scene.camera!r}; give "
                 f"moves=object, or have it seen by {ORBIT_CAMERA!r}"
             )
+        self._check_needless()
         there = self.within(scene)
         for name, ways in zip(_names(self.chosen["path"]), self._paths, strict=True):
             if CAMERA in ways:
@@ -215,7 +343,12 @@ class PathControl(Control):
         inputs = {}
         if CAMERA in self._movers:
             place, target = self._camera(ways, start, time, shift)
-            inputs["camera.to_world"] = looking(place, target, self.scene.number("camera.roll"))
+            roll = self.scene.number("camera.roll")
+            way = ways.get(CAMERA)
+            if isinstance(way, Waypoints) and way.rotations is not None:
+                inputs["camera.to_world"] = pose_camera(place, way.rotation_at(time), roll)
+            else:
+                inputs["camera.to_world"] = looking(place, target, roll)
         if THING in self._movers:
             inputs["object.to_world"] = turned(start, shift, heading)
         return inputs
@@ -237,8 +370,11 @@ class PathControl(Control):
         if way is None:
             return start, center
         if isinstance(way, Waypoints):
+            place = center + way.at(time, way.places) / self.scene.metres
+            if way.rotations is not None:
+                return place, place + way.rotation_at(time)[..., 2]
             target = center + (shift if way.targets is None else way.at(time, way.targets) / self.scene.metres)
-            return center + way.at(time, way.places) / self.scene.metres, target
+            return place, target
         away, reach = (start - center).norm(), float(self.chosen["reach"])
         share = (time / self.seconds).clamp(0.0, 1.0)
         if way == APPROACH:
@@ -287,8 +423,42 @@ def looking(place: Tensor, target: Tensor, roll: float) -> Tensor:
     level = torch.stack([-ahead[1], ahead[0], torch.zeros_like(ahead[0])])
     aside = torch.tensor([0.0, 1.0, 0.0]).to(ahead)  # where it looks straight up or down
     left = torch.where(level.norm() > 1e-6, level / level.norm().clamp_min(1e-6), aside)
-    up, (cos, sin) = torch.linalg.cross(ahead, left), (math.cos(math.radians(roll)), math.sin(math.radians(roll)))
+    return _rolled(place, left, torch.linalg.cross(ahead, left), ahead, roll)
+
+
+def pose_camera(place: Tensor, rotation: Tensor, roll: float) -> Tensor:
+    """Return the pose (4, 4) of a camera at a place (3,) whose right, down and ahead are the columns of a rotation,
+    rolled by degrees."""
+    right, down, ahead = rotation.unbind(dim=-1)
+    return _rolled(place, -right, -down, ahead, roll)
+
+
+def _rolled(place: Tensor, left: Tensor, up: Tensor, ahead: Tensor, roll: float) -> Tensor:
+    cos, sin = math.cos(math.radians(roll)), math.sin(math.radians(roll))
     return affine(torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1), place)
+
+
+def measure_tilt(rotations: Rotation) -> float:
+    """Return how far the top of a camera's pictures is from up, degrees, on average over its rotations."""
+    upwards = -rotations.as_matrix()[:, 2, 1]
+    return math.degrees(math.acos(float(np.clip(upwards.mean(), -1.0, 1.0))))
+
+
+def align_quaternions(quaternions: Doubles) -> Doubles:
+    """Return quaternions (n, 4) with signs such that each is nearer to the one before than its opposite is."""
+    turns_back = (quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0.0
+    signs = np.where(np.cumsum(np.concatenate([[False], turns_back])) % 2, -1.0, 1.0)
+    return np.asarray(quaternions * signs[:, None])
+
+
+def check_times(path: Path, times: Doubles) -> None:
+    """Raise FileFormatError: times (n,) from the first on are too few or many, or do not ascend within limits."""
+    if not 2 <= len(times) <= MOST_WAYPOINTS:
+        raise FileFormatError(f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(times)}")
+    if not (np.isfinite(times).all() and (np.diff(times) >= SHORTEST * (1.0 - ROUNDED)).all() and times[-1] <= LONGEST):
+        raise FileFormatError(
+            f"{path}: expected times that ascend, by {SHORTEST:g} s at least and {LONGEST:g} s in all, got others"
+        )
 
 
 def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
@@ -320,21 +490,24 @@ def _names(path: object) -> tuple[str, ...]:
 
 
 def _is_path(name: str) -> bool:
-    return name in PATHS or name.lower().endswith(".csv")
+    return name in PATHS or name.lower().endswith(PATH_ENDINGS)
 
 
-def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, Waypoints]:
-    """Return the way of all that travels, from a .csv file with the columns time, x, y, z, and look_x, look_y, look_z
-    or heading. It is about the `mover`; unless `alone`, one about the camera may say what the object does at the same
-    times.
+def _read_text(path: Path) -> str:
+    try:
+        return read_text(path, "a table of waypoints", MOST_BYTES).removeprefix("\ufeff")
+    except OSError as error:
+        raise FileFormatError(f"{path}: expected a table of waypoints, got {error.strerror}") from error
+
+
+def read_waypoints(path: Path, mover: str, *, text: str, alone: bool = True) -> dict[str, Waypoints]:
+    """Return the way of all that travels, from the text of a .csv file with the columns time, x, y, z, and look_x,
+    look_y, look_z or heading. It is about the `mover`; unless `alone`, one about the camera may say what the object
+    does at the same times.
 
     Raises FileFormatError: it is no table of numbers with the columns that a path needs, or its times do not ascend.
     """
     further = (HEADING,) if mover == THING else (*LOOKING, *SHIFT, TURNING) if alone else LOOKING
-    try:
-        text = read_text(path, "a table of waypoints", MOST_BYTES).removeprefix("\ufeff")
-    except OSError as error:
-        raise FileFormatError(f"{path}: expected a table of waypoints, got {error.strerror}") from error
     try:
         header, *rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines()) if any(row)] or [[]]
     except csv.Error as error:
@@ -344,7 +517,7 @@ def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, W
     if missing or twice or set(header) - {*columns, *further} or any(parts):
         raise FileFormatError(
             f"{path}: expected columns {', '.join(columns)}, and perhaps {', '.join(further)}, got "
-            f"{', '.join(header)[:200] or 'nothing'}"
+            f"{', '.join(header)[:200] or 'nothing'}; or a trajectory of TUM, EuRoC or KITTI"
         )
     if not 2 <= len(rows) <= MOST_WAYPOINTS:
         raise FileFormatError(f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(rows)}")
@@ -353,10 +526,7 @@ def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, W
     except ValueError as error:
         raise FileFormatError(f"{path}: expected {len(header)} numbers in each row, got something else") from error
     times = table[:, header.index(TIME)] - table[0, header.index(TIME)]
-    if not (np.isfinite(times).all() and (np.diff(times) >= SHORTEST * (1.0 - ROUNDED)).all() and times[-1] <= LONGEST):
-        raise FileFormatError(
-            f"{path}: expected times that ascend, by {SHORTEST:g} s at least and {LONGEST:g} s in all, got others"
-        )
+    check_times(path, times)
     column = {name: table[:, place] for place, name in enumerate(header) if name != TIME}
     if not all(np.abs(one).max() <= FARTHEST for one in column.values()):
         raise FileFormatError(f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none")
@@ -374,9 +544,9 @@ def read_waypoints(path: Path, mover: str, *, alone: bool = True) -> dict[str, W
 
     places, seconds = read(*PLACE), torch.from_numpy(times.astype(np.float32))
     assert places is not None
-    ways = {mover: Waypoints(seconds, places, read(*LOOKING), read(HEADING), notes.get(HEADING, ()))}
+    ways = {mover: Waypoints(seconds, places, read(*LOOKING), read(HEADING), notes=notes.get(HEADING, ()))}
     shift = read(*SHIFT)
     if shift is not None or TURNING in column:
         shift = torch.zeros_like(places) if shift is None else shift
-        ways[THING] = Waypoints(seconds, shift, None, read(TURNING), notes.get(TURNING, ()))
+        ways[THING] = Waypoints(seconds, shift, None, read(TURNING), notes=notes.get(TURNING, ()))
     return ways

@@ -135,8 +135,9 @@ class Space:
 
     @property
     def exposure(self) -> tuple[float, float]:
-        """Seconds that the shutter is open, and that rows are read in."""
-        return max((control.exposure for control in self.controls), default=(0.0, 0.0))
+        """Seconds that the shutter is open, and that rows are read in, below 0 from the bottom."""
+        exposures = (control.exposure for control in self.controls)
+        return max(exposures, key=lambda exposure: tuple(map(abs, exposure)), default=(0.0, 0.0))
 
     def later(self, seconds: float) -> Space:
         """Return the space so many seconds later, where a control knows a time."""

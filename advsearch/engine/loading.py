@@ -269,15 +269,16 @@ def exposed_in(space: Space, motion: Motion, assembly: Assembly, height: int) ->
     """Return the moments of an exposure, so many that no point goes far in the picture between two of them, and that
     light which flashes is seen on and off."""
     shutter, rolling = space.exposure
+    duration = shutter + abs(rolling)
     moving = replace(space, controls=tuple(control for control in space.controls if any(control.exposure)))
-    ends = [moving.later(side * (shutter + rolling) / 2.0) for side in (-1.0, 1.0)]
+    ends = [moving.later(side * duration / 2.0) for side in (-1.0, 1.0)]
     draws = torch.rand(LOOKS, len(moving.start), generator=torch.Generator().manual_seed(0))
     travelled = 0.0
     for u in draws:
         (before, seen), (after, still) = (motion.pixels(assembly(end.inputs(u))) for end in ends)
         moved = (after - before)[seen & still].norm(dim=1)
         travelled = max(travelled, float(moved.max()) if len(moved) else 0.0)
-    flashes = max(control.flashes for control in space.controls) * (shutter + rolling)
+    flashes = max(control.flashes for control in space.controls) * duration
     count = min(max(FEWEST, math.ceil(A_PIXEL * travelled), math.ceil(A_FLASH * flashes)), MOST)
     offsets, rows, samples = moments_of(shutter, rolling, height, count)
     return tuple(Moment(space.later(float(at)), own, samples) for at, own in zip(offsets, rows, strict=True))

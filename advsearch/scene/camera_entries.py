@@ -15,6 +15,7 @@ from typing import Any
 from advsearch.errors import FileFormatError
 from advsearch.scene.camera_model import COEFFICIENTS, EQUIRECTANGULAR, NUMBERS, CameraModel
 from advsearch.scene.importing.files import shown
+from advsearch.scene.importing.unread import TrackedKeys, join_names
 
 MOST_PIXELS = 1 << 16  # largest side of a picture
 LARGEST_COEFFICIENT, LARGEST_FOCAL = 1e4, 1e3  # of coefficients, and of focal lengths in sides of the picture
@@ -55,25 +56,22 @@ class Entries:
 
     def __init__(self, path: str, given: Mapping[str, Any]) -> None:
         self.path = path
-        self._spelled: dict[str, str] = {}
-        for name in given:
-            if (first := self._spelled.setdefault(plain(name), name)) != name:
-                raise FileFormatError(f"{path}: has {shown(first)} and {shown(name)}; leave one of them out")
-        self._given = {plain(name): value for name, value in given.items()}
-        self._used: set[str] = set()
+        self._keys: TrackedKeys[Any] = TrackedKeys(given, fold=plain)
+        for first in self._keys.repeated:
+            other = self._keys.spelled(plain(first))
+            raise FileFormatError(f"{path}: has {shown(first)} and {shown(other)}; leave one of them out")
         self._odd: list[str] = []
 
     def get(self, *names: str) -> Any:
         """Return the first of these entries that has a value."""
-        known = [name for name in names if self._given.get(name) is not None]
-        self._used |= {*names} - {*known[1:]}
-        return self._given[known[0]] if known else None
+        return self._keys.get(*names)
 
     def there(self, name: str, names: Sequence[str] = ()) -> Any:
         """Return an entry, or the first of several names for it. Raises FileFormatError: there is none."""
         value = self.get(*(names or (plain(name),)))
         if value is None:
-            has = ", ".join(list(self._spelled.values())[:8]) or "nothing"
+            spelled = [self._keys.spelled(key) for key, _ in self._keys.items()]
+            has = join_names(spelled, 8) or "nothing"
             raise FileFormatError(f"{self.path}: expected {name}, got {has}; add it")
         return value
 
@@ -98,18 +96,35 @@ class Entries:
         """Return the entries that nobody asked for, as they are spelled, with a dot after the entry that they are
         within. Raises FileFormatError: one of them changes the picture."""
         unread = [within + key for key in self._odd]
-        for name, spelled in self._spelled.items():
-            if name in self._used or QUIET.fullmatch(name):
-                continue
-            of_another = name.endswith("2") and f"{name[:-1]}1" in self._spelled  # of a stereo pair
+        for spelled in self._keys.unread(lambda name, _: QUIET.fullmatch(name) is not None):
+            name = plain(spelled)
+            value = self._keys.peek(name)
+            is_coefficient = name in COEFFICIENTS and not isinstance(value, (list, Mapping))
+            of_another = name.endswith("2") and f"{name[:-1]}1" in self._keys and not is_coefficient  # of a stereo pair
             if not BENDS.fullmatch(name) or OF_RECTIFIED.fullmatch(name) or of_another:
                 unread.append(within + spelled)
-            elif not nothing(value := self._given[name]):
+            elif not nothing(value):
                 raise FileFormatError(
                     f"{self.path}: expected no {shown(within + spelled)}, got {shown(str(value))}: it makes another"
                     " picture and is not read; calibrate with one of the models in docs/cameras.md"
                 )
         return unread
+
+
+def select_camera(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
+    """Return the camera of a name out of those of a file, or the only one.
+
+    Raises FileFormatError: there is none of that name, or there are several and none is named.
+    """
+    names = list(map(str, cameras))
+    listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+    first = f"{path}#{names[0]}"
+    if which and which not in names:
+        raise FileFormatError(f"{path}: expected one of its cameras {listed}, got {which[:40]!r}; write {first}")
+    if not which and len(names) > 1:
+        what = f"has {len(names)} cameras, {listed}"
+        raise FileFormatError(f"{path}: {what}: say which one takes the picture, as in {first}")
+    return cameras[which or names[0]]
 
 
 def nothing(value: object) -> bool:
@@ -141,7 +156,7 @@ def number(path: str, name: str, given: object) -> float:
 
 def with_told(model: CameraModel, left: Sequence[str], rectified: Sequence[str] = ()) -> CameraModel:
     """The model with notes that name what was not read: of the camera, and about rectified pictures."""
-    unread = [", ".join(map(shown, left[:12])) + (", ..." if len(left) > 12 else "") + "."] if left else []
+    unread = [f"{join_names(left)}."] if left else []
     if rectified:
         whose = "which are made of the camera's own ones; these are its own."
         unread.append(f"{' and '.join(rectified)}, about rectified pictures, {whose}")

@@ -1,5 +1,7 @@
 """Camera files of OpenCV, Kalibr (EuRoC), ROS (`camera_info`), camodocal (VINS), COLMAP and nerfstudio.
 
+Those of further tools are translated by `camera_dialects` before.
+
 The centre of the first pixel is (0.5, 0.5) in the last two and (0, 0) in the others; what comes out is measured from
 the picture's corner. An entry that no reader asks for is named in a note, or refused where it makes another picture.
 """
@@ -16,7 +18,14 @@ from xml.etree import ElementTree
 
 from advsearch.errors import FileFormatError
 from advsearch.files import MESHES, parse_json, parsed, present_text
-from advsearch.scene.camera_entries import Entries, made, nothing, number, plain, with_told
+from advsearch.scene.camera_dialects import (
+    METASHAPE_FILE,
+    check_text_format,
+    check_xml_root,
+    describe_projection,
+    translate_entries,
+)
+from advsearch.scene.camera_entries import Entries, made, nothing, number, plain, select_camera, with_told
 from advsearch.scene.camera_model import BROWN_CONRADY, COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, CameraModel
 from advsearch.scene.importing.files import CAMERAS, shown
 from advsearch.yaml_text import LARGEST, parse_yaml
@@ -48,13 +57,16 @@ OF_DISTORTION = {
     EQUIRECTANGULAR: EQUIRECTANGULAR,
 }
 """The distortion models of ROS, Kalibr and EuRoC that are one of ours."""
-MATRIX = ("cameramatrix", "k", "intrinsicmatrix", "mtx", "cameramatrix1", "m1")
+MATRIX = (
+    *("cameramatrix", "k", "intrinsicmatrix", "mtx", "cameramatrix1", "m1"),
+    *("intrinsics", "cameraintrinsics"),  # of ARKit
+)
 DISTORTION = (
     *("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoeff", "distortion", "d", "dist"),
     *("coeffs", "coefficients", "distortioncoefficients1", "distcoeffs1", "d1"),
 )
 WIDTH, HEIGHT = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
-SIZE = ("imagesize", "resolution")
+SIZE = ("imagesize", "resolution", "imageresolution")
 GROUPS = ("projection_parameters", "distortion_parameters", "mirror_parameters")  # of camodocal (VINS)
 KANNALA = {"mu": "fx", "mv": "fy", "u0": "cx", "v0": "cy", "k2": "k1", "k3": "k2", "k4": "k3", "k5": "k4"}
 """What camodocal calls the numbers of a fisheye, and OpenCV."""
@@ -83,13 +95,17 @@ def read_camera(spec: str) -> CameraModel:
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if lines and re.fullmatch(r"\d+\s+[A-Za-z_]\w*\s.*", lines[0].strip()):
         return _of_colmap(spec, path, which, lines)
+    check_text_format(path, text)
     data = _data(path, text)
+    translated = translate_entries(path, which, data)
+    if translated is not None:
+        return _of_opencv(spec, Entries(path, translated))
     if "frames" in data or "fl_x" in data or "camera_angle_x" in data:
         return _of_nerfstudio(spec, which, data)
     cameras = {name: entry for name, entry in data.items() if isinstance(entry, dict) and "intrinsics" in entry}
     if cameras:
         rest = Entries(path, {name: entry for name, entry in data.items() if name not in cameras})
-        return _of_kalibr(spec, Entries(path, _chosen(path, which, cameras)), rest.told())
+        return _of_kalibr(spec, Entries(path, select_camera(path, which, cameras)), rest.told())
     if which:
         wanted = f"expected several cameras, as {which!r} is asked for"
         raise FileFormatError(f"{path}: {wanted}, got one; leave #{which} out")
@@ -108,7 +124,8 @@ def _data(path: str, text: str) -> dict[str, Any]:
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
             raise FileFormatError(f"{path}: declares a document type or entities, which no camera needs; remove it")
         root = parsed(path, text, "XML", ElementTree.fromstring)
-        if root.tag != "opencv_storage":
+        check_xml_root(path, root.tag)
+        if root.tag not in ("opencv_storage", METASHAPE_FILE):
             raise FileFormatError(
                 f"{path}: expected a camera of OpenCV in <opencv_storage>, got <{root.tag[:40]}>; docs/cameras.md has "
                 "the formats that are read"
@@ -135,18 +152,6 @@ def _data(path: str, text: str) -> dict[str, Any]:
     return data
 
 
-def _chosen(path: str, which: str, cameras: Mapping[str, Any]) -> Any:
-    names = list(map(str, cameras))
-    listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
-    first = f"{path}#{names[0]}"
-    if which and which not in names:
-        raise FileFormatError(f"{path}: expected one of its cameras {listed}, got {which[:40]!r}; write {first}")
-    if not which and len(names) > 1:
-        what = f"has {len(names)} cameras, {listed}"
-        raise FileFormatError(f"{path}: {what}: say which one takes the picture, as in {first}")
-    return cameras[which or names[0]]
-
-
 # ---- the formats ----------------------------------------------------------------------------------------------------
 
 
@@ -155,7 +160,7 @@ def _of_colmap(spec: str, path: str, which: str, lines: Sequence[str]) -> Camera
     if len(rows) < len(lines):
         twice = "expected each camera once, got one with the same number twice"
         raise FileFormatError(f"{path}: {twice}; correct the file")
-    _, name, *rest = _chosen(path, which, rows)
+    _, name, *rest = select_camera(path, which, rows)
     if name not in COLMAP:
         raise FileFormatError(
             f"{path}: expected one of COLMAP's models {', '.join(COLMAP)}, got {name[:40]}, which is another projection"
@@ -178,7 +183,7 @@ def _of_nerfstudio(spec: str, which: str, data: Mapping[str, Any]) -> CameraMode
     lenses = [{key: frame[key] for key in frame if key in OF_A_FRAME} for frame in frames] or [{}]
     lens = lenses[0]
     if which or any(other != lens for other in lenses):
-        lens = _chosen(path, which, dict(zip(map(str, range(len(lenses))), lenses, strict=True)))
+        lens = select_camera(path, which, dict(zip(map(str, range(len(lenses))), lenses, strict=True)))
     others = {key: value for frame in frames for key, value in frame.items() if key not in OF_A_FRAME | OF_A_SCENE}
     entries = Entries(path, {key: value for key, value in data.items() if key not in OF_A_SCENE} | lens)
     width, height = (entries.number(side) for side in ("w", "h"))
@@ -211,8 +216,8 @@ def _of_kalibr(spec: str, entries: Entries, beside: Sequence[str] = ()) -> Camer
     model = str(entries.get("cameramodel") or "pinhole")
     if model != "pinhole":
         raise FileFormatError(
-            f"{path}: expected the camera_model pinhole of Kalibr, got {model[:40]}, which is another projection; "
-            "calibrate as pinhole-equi or pinhole-radtan"
+            f"{path}: expected the camera_model pinhole of Kalibr, got {model[:40]}"
+            f"{describe_projection(model) or ', which is not read; calibrate as pinhole-equi or pinhole-radtan'}"
         )
     kind = _kind(path, entries.get("distortionmodel"))
     focal = entries.numbers("intrinsics", entries.get("intrinsics"), (4,))
@@ -243,6 +248,8 @@ def _of_opencv(spec: str, entries: Entries) -> CameraModel:
             f"{path}: expected a calibrated camera, got a camera_matrix (K) of zeros, as ROS says of one that is not "
             "calibrated; calibrate it, and give the file that this writes"
         )
+    if not any(matrix[place] for place in (1, 2, 5)) and any(matrix[6:8]):
+        matrix = [matrix[3 * column + row] for row in range(3) for column in range(3)]  # by columns: Open3D, ARKit
     if matrix[3] or matrix[6] or matrix[7] or matrix[8] != 1.0:
         raise FileFormatError(f"{path}: camera_matrix: expected fx, skew, cx, 0, fy, cy, 0, 0, 1, got other numbers")
     size, fisheye = _size(entries), kind == FISHEYE
@@ -310,6 +317,7 @@ def _kind(path: str, named: object) -> str:
     if name not in OF_DISTORTION:
         raise FileFormatError(
             f"{path}: expected one of the distortion models {', '.join(filter(None, OF_DISTORTION))}, got {name[:40]!r}"
+            f"{describe_projection(name) or '; calibrate with one of these'}"
         )
     return OF_DISTORTION[name]
 

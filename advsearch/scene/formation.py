@@ -291,10 +291,10 @@ def _edges(size: int, count: int) -> Ints:
 # ---------------------------------------------------------------------------------------------------------------------
 # When the rows of a picture are exposed: an open shutter (motion blur) and rows that are read one after the other.
 #
-# A row r of H is exposed for `shutter` seconds, and rows are read within `rolling` seconds; the middle of the picture's
-# exposure is the time of the configuration. What a sensor counts is light, so a row is the mean of linear radiance over
-# its exposure, before the denoiser and the tone curve. The mean is over M moments, evenly spaced, of which each row
-# takes those in its own exposure.
+# A row r of H is exposed for `shutter` seconds, and rows are read within `rolling` seconds, the first at the top, or at
+# the bottom where that is below 0; the middle of the picture's exposure is the time of the configuration. What
+# a sensor counts is light, so a row is the mean of linear radiance over its exposure, before the denoiser and the tone
+# curve. The mean is over M moments, evenly spaced, of which each row takes those in its own exposure.
 
 FEWEST, MOST = 8, 64
 A_PIXEL = 2  # moments for each pixel that the fastest point of the picture moves while it is taken
@@ -320,8 +320,10 @@ class Moment:
 def moments_of(shutter: float, rolling: float, height: int, count: int) -> tuple[Tensor, Tensor, float]:
     """Return when so many moments M are, in seconds from the middle of the exposure (M,); their shares of the rows of a
     picture (M, H), whose columns add up to 1; and the part of a pixel's samples that each takes. Each row is exposed
-    for `shutter` seconds, and rows are read within `rolling` seconds, both at least 0; with as many moments as rows and
-    no shutter, each row has the moment of its own."""
+    for `shutter` seconds, at least 0, and rows are read within `rolling` seconds, from the bottom where that is below
+    0; with as many moments as rows and no shutter, each row has the moment of its own."""
+    is_from_bottom = rolling < 0.0
+    rolling = abs(rolling)
     cell = (shutter + rolling) / count
     begins = torch.arange(count, dtype=torch.float64) * cell
     opens = rolling * (torch.arange(height, dtype=torch.float64) + 0.5) / height
@@ -332,6 +334,8 @@ def moments_of(shutter: float, rolling: float, height: int, count: int) -> tuple
         ends = torch.minimum(begins[:, None] + cell, opens + shutter)
         shares = (ends - torch.maximum(begins[:, None], opens)).clamp_min(0.0)
     shares = shares / shares.sum(dim=0)
+    if is_from_bottom:
+        shares = shares.flip(1)
     offsets = begins + cell / 2.0 - (shutter + rolling) / 2.0
     return offsets, shares.float(), min(1.0, cell / shutter if shutter else 1.0)
 

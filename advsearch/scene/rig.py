@@ -33,6 +33,7 @@ LATEST = 60.0  # seconds after the first picture
 AXES = np.diag([-1.0, -1.0, 1.0, 1.0])  # from x to the right, y down, z ahead to Mitsuba's: left, up, ahead
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """From nerfstudio's axes of a camera, x to the right, y up, z back, to x to the right, y down, z ahead."""
+SMALLEST_SCALE = 1e-6  # by which the positions of a file may have been scaled, and one over it
 COLMAPS = "images.txt"
 MOST_BYTES = 1 << 26  # of COLMAP's images, whose lines of points are skipped
 STEP = "T_cn_cnm1"  # Kalibr's: from points of the camera before to points of this one
@@ -144,15 +145,45 @@ def _of_transforms(path: str, which: str) -> tuple[Mount, ...]:
         raise FileFormatError(f"{path}: expected `frames`, a list with a camera each, as nerfstudio writes it")
     names = _named(path, which, [str(number) for number in range(len(frames))])
     chosen = {name: frames[int(name)] for name in names}
-    poses = [
-        _rigid(f"{path}: frame {name}", "transform_matrix", frame.get("transform_matrix")) @ FROM_OPENGL
-        for name, frame in chosen.items()
-    ]
+    scale = _read_applied_scale(path, data)
+    poses = list[Doubles]()
+    for name, frame in chosen.items():
+        pose = _rigid(f"{path}: frame {name}", "transform_matrix", frame.get("transform_matrix")) @ FROM_OPENGL
+        pose[:3, 3] /= scale
+        poses.append(pose)
     lenses = [{key: frame[key] for key in frame if key in OF_A_FRAME} for frame in chosen.values()]
     first = read_camera(f"{path}#{names[0]}")
     each = zip(names, lenses, strict=True)
     models = [first if lens == lenses[0] else read_camera(f"{path}#{name}") for name, lens in each]
     return _mounted(path, names, poses, models)
+
+
+def _read_applied_scale(path: str, data: Mapping[str, Any]) -> float:
+    """Return by what the positions of a transforms.json were multiplied before it was written.
+
+    nerfstudio's `applied_scale`, times the scale within its `applied_transform`. A rotation and a shift of the world
+    change nothing between two cameras. Instant NGP's `scale` and `offset` are applied by who reads the file, so that
+    its positions are without them.
+    """
+    scale = 1.0
+    if data.get("applied_scale") is not None:
+        (scale,) = _numbers(path, "applied_scale", [data["applied_scale"]], 1, 1.0 / SMALLEST_SCALE)
+    if data.get("applied_transform") is not None:
+        given = data["applied_transform"]
+        rows = given if isinstance(given, list) and all(isinstance(row, list) for row in given) else []
+        count = 12 if len(rows) == 3 else 16
+        numbers = _numbers(path, "applied_transform", [number for row in rows for number in row], count, FARTHEST)
+        turn = np.reshape(numbers, (-1, 4))[:3, :3]
+        turn_scale = abs(float(np.linalg.det(turn))) ** (1.0 / 3.0)
+        if not np.allclose(turn @ turn.T, turn_scale**2 * np.eye(3), atol=1e-3 * turn_scale**2):
+            raise FileFormatError(
+                f"{path}: applied_transform: expected a rotation, a shift and a scale, got another map"
+            )
+        scale *= turn_scale
+    if not SMALLEST_SCALE <= scale <= 1.0 / SMALLEST_SCALE:
+        wanted = f"from {SMALLEST_SCALE:g} to {1.0 / SMALLEST_SCALE:g}"
+        raise FileFormatError(f"{path}: applied_scale: expected a scale {wanted}, got {scale:g}; correct it")
+    return scale
 
 
 def _of_colmap(path: str, which: str) -> tuple[Mount, ...]:

@@ -7,8 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import advsearch
@@ -18,6 +20,7 @@ from advsearch.engine.rendering import sight_of
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world, middle, object_to_world
+from advsearch.scene.pose_files import SENSOR_AXES, WORLD_TO_Z_UP
 from advsearch.tasks import Facts
 
 WAY = "time, x, y, z\n3, 2, 0, 1\n4, 2, 2, 1\n7, -2, 2, 1\n"
@@ -344,7 +347,7 @@ def test_what_does_not_go_together_is_refused(scene: SceneDescription, tmp_path:
     file = tmp_path / "way.csv"
     file.write_text(WAY)
     with pytest.raises(
-        InputError, match=r"path\.path: expected approach, pass, orbit, a \.csv file, or two of them .* got 'apr"
+        InputError, match=r"path\.path: expected approach, pass, orbit, a \.csv or .* file, or two of them .* got 'apr"
     ):
         PathControl(path="aproach")
     for path in (str(file), f"approach+{file}"):
@@ -388,3 +391,173 @@ def test_a_file_that_is_shorter_than_others_is_told(scene: SceneDescription, tmp
     (tmp_path / "longer.csv").write_text(WAY + "9, 1, 2, 1\n")
     there = PathControl(path=f"{tmp_path / 'way.csv'},{tmp_path / 'longer.csv'}").prepare(scene)
     assert any("takes 4 s of 6" in one for one in there.remarks)
+
+
+# ---- trajectories of other tools ------------------------------------------------------------------------------------
+
+OPTICAL_TO_WORLD = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""A camera (x right, y down, z ahead) that looks level along -x, in a world whose z is up."""
+STEP_SECONDS, SPEED = 0.5, 2.0
+HEADER = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+
+
+def trajectory(form: str, axes: str = "optical", up: str = "z", at: tuple[float, ...] = (0.0, 0.0, 0.0)) -> str:
+    """The text of five poses from (6, 0, 1) to (2, 0, 1), in a world and of a sensor with some axes."""
+    world = WORLD_TO_Z_UP[up].T
+    rotation = Rotation.from_matrix(world @ OPTICAL_TO_WORLD @ SENSOR_AXES[axes].T)
+    quaternion = rotation.as_quat()
+    lines = []
+    for step in range(5):
+        place = world @ np.array([6.0 - step, 0.0, 1.0]) + np.array(at)
+        seconds = 1403636579.5 + STEP_SECONDS * step
+        nanoseconds = 1403636579500000000 + step * 500000000
+        sign = -1.0 if step % 2 else 1.0  # the same rotation
+        xyzw = " ".join(f"{sign * value:.9f}" for value in quaternion)
+        wxyz = " ".join(f"{sign * value:.9f}" for value in np.roll(quaternion, 1))
+        xyz = " ".join(f"{value:.9f}" for value in place)
+        if form == "tum":
+            lines.append(f"{seconds:.6f} {xyz} {xyzw}")
+        elif form == "tum, real part first":
+            lines.append(f"{seconds:.6f} {xyz} {wxyz}")
+        elif form == "tum in nanoseconds":
+            lines.append(f"{nanoseconds} {xyz} {xyzw}")
+        elif form == "euroc":
+            lines.append(f"{nanoseconds},{xyz.replace(' ', ',')},{wxyz.replace(' ', ',')}")
+        elif form == "euroc, all columns":
+            lines.append(f"{nanoseconds}, {xyz.replace(' ', ', ')}, {wxyz.replace(' ', ', ')}, 0.1, 0.2, 0.3")
+        else:
+            lines.append(" ".join(f"{value:.9e}" for value in np.column_stack([rotation.as_matrix(), place]).flat))
+    heads = {
+        "tum": "# a trajectory\n# timestamp tx ty tz qx qy qz qw\n",
+        "tum, real part first": "# timestamp tx ty tz qw qx qy qz\n",
+        "euroc": HEADER + "\n",
+        "euroc, all columns": HEADER + ", v_RS_R_x [m s^-1], b_w_RS_S_x [rad s^-1], b_a_RS_S_x [m s^-2]\n",
+    }
+    return heads.get(form, "") + "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("form", "axes", "up", "at"),
+    [
+        ("tum", "optical", "z", (0.0, 0.0, 0.0)),
+        ("tum, real part first", "optical", "z", (0.0, 0.0, 0.0)),
+        ("tum in nanoseconds", "opengl", "y", (0.0, 0.0, 0.0)),
+        ("tum", "optical", "-y", (1.0, 2.0, 3.0)),
+        ("euroc", "optical", "z", (0.0, 0.0, 0.0)),
+        ("euroc", "euroc", "z", (4e5, 5e6, 100.0)),
+        ("euroc, all columns", "flu", "z", (0.0, 0.0, 0.0)),
+        ("euroc", "frd", "-z", (0.0, 0.0, 0.0)),
+        ("kitti", "optical", "-y", (20.0, 0.0, 0.0)),
+        ("kitti", "flu", "z", (0.0, 0.0, 0.0)),
+    ],
+)
+def test_a_trajectory_is_followed_by_a_camera_with_its_axes(
+    scene: SceneDescription, tmp_path: Path, form: str, axes: str, up: str, at: tuple[float, ...]
+) -> None:
+    file = tmp_path / "poses.txt"
+    file.write_text(trajectory(form, axes, up, at))
+    given: dict[str, Any] = {"axes": axes, "up": up, "object_at": list(at)}
+    if form == "kitti":
+        given["seconds"] = 2.0
+    level = describe("mug", size=1.0)
+    control = bound(level, path=str(file), **given)
+    assert control.seconds == pytest.approx(2.0)
+    center = torch.from_numpy(middle(level)).float()
+    ahead = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # columns: left, up, ahead
+    for share in (0.0, 0.3, 1.0):
+        pose = placed(control, share)
+        torch.testing.assert_close(pose[:3, 3] - center, torch.tensor([6.0 - 4.0 * share, 0.0, 1.0]), atol=2e-2, rtol=0)
+        torch.testing.assert_close(pose[:3, :3], ahead, atol=1e-5, rtol=0)
+    notes = [note for note in PathControl(path=str(file), **given).prepare(level).notes if "poses.txt" in note]
+    assert [("not read: 'v_RS_R_x" in note, "read as ns" in note) for note in notes] in (
+        [], [(form == "euroc, all columns", form == "tum in nanoseconds")],
+    )  # fmt: skip
+    assert bool(notes) == (form in ("euroc, all columns", "tum in nanoseconds"))
+
+
+def test_what_a_trajectory_does_not_state_is_said_and_odd_axes_are_doubted(tmp_path: Path) -> None:
+    file, level = tmp_path / "poses.tum", describe("mug", size=1.0)
+    file.write_text(trajectory("tum"))
+    (note,) = [note for note in PathControl(path=str(file)).prepare(level).notes if "poses.tum" in note]
+    assert "axes optical (x right, y down, z ahead), up z, object_at [0, 0, 0]" in note
+    file.write_text(trajectory("tum", up="-y"))
+    assert any("90 degrees from up" in note for note in PathControl(path=str(file)).prepare(level).notes)
+    file.write_text(trajectory("kitti", up="-y", at=(9.0, 0.0, 0.0)))
+    control = PathControl(path=str(file), object_at=[9, 0, 0])
+    assert control.seconds == pytest.approx(0.4)
+    assert any("seconds 10 poses a second" in note and "up -y" in note for note in control.prepare(level).notes)
+
+
+def test_without_axes_the_camera_looks_at_the_object(scene: SceneDescription, tmp_path: Path) -> None:
+    file, own, leica = tmp_path / "poses.txt", tmp_path / "own.csv", tmp_path / "leica.csv"
+    file.write_text(trajectory("tum"))
+    own.write_text("time,x,y,z\n0,6,0,1\n0.5,5,0,1\n1,4,0,1\n1.5,3,0,1\n2,2,0,1\n")
+    leica.write_text("#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]\n0, 6, 0, 1\n2000000000, 2, 0, 1\n")
+    for other in (bound(scene, path=str(file), axes="none"), bound(scene, path=str(leica))):
+        for share in (0.0, 0.3, 1.0):
+            torch.testing.assert_close(
+                placed(other, share), placed(bound(scene, path=str(own)), share), atol=1e-5, rtol=0
+            )
+
+
+def test_a_derivative_along_a_trajectory_is_that_of_differences(scene: SceneDescription, tmp_path: Path) -> None:
+    file = tmp_path / "poses.txt"
+    file.write_text("0 6 0 1 -0.5 -0.5 0.5 0.5\n1 4 1 1 0 -0.7071068 0 0.7071068\n")
+    control, step = bound(scene, path=str(file)), 1e-2
+    derivative = torch.autograd.functional.jacobian(
+        lambda u: next(iter(control.inputs(u).values())), torch.tensor([0.4])
+    )
+    difference = (placed(control, 0.4 + step) - placed(control, 0.4 - step)) / (2.0 * step)
+    torch.testing.assert_close(derivative[..., 0], difference, atol=2e-2, rtol=2e-2)
+
+
+TUM_ROW = "1 6 0 1 -0.5 -0.5 0.5 0.5\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 6 0 1 -0.5 -0.5 0.5 0.7\n" + TUM_ROW, "pose 1: expected a quaternion of length 1, got one of 1.11"),
+        ("0 6 0 1 0 0 0 0\n" + TUM_ROW, "expected a quaternion of length 1, got one of 0"),
+        ("0 6 0 1 nan 0 0 1\n" + TUM_ROW, "expected finite numbers"),
+        ("0 inf 0 1 0 0 0 1\n" + TUM_ROW, "expected finite numbers"),
+        (TUM_ROW + TUM_ROW, "expected times that ascend"),
+        (TUM_ROW, "expected 2 to 100000 waypoints, got 1"),
+        ("0 6 0 1 0 0 0 1\n5000000000 6 0 1 0 0 0 1\n", "expected times that ascend"),
+        ("0 6e6 0 1 0 0 0 1\n" + TUM_ROW, "expected positions within 100000 of the object"),
+        (TUM_ROW + "2 6 0 1\n", "expected 8 numbers in each row, got '2 6 0 1'"),
+        (TUM_ROW + "2 6 0 1 a b c d\n", "expected 8 numbers in each row"),
+        ("1 2 3\n4 5 6\n", "expected 8 numbers a line as TUM's .* or 12 as KITTI's poses, got 3"),
+        ("0 1 0 0 0 0 1 0 0 0 0 1 0\n" * 2, "got 13 .KITTI-360"),
+        ("1,6,0,1,-0.5,-0.5,0.5,0.5\n2,5,0,1,-0.5,-0.5,0.5,0.5\n", "expected a first line that names the columns"),
+        (HEADER.replace("[ns]", "[h]") + "\n1,6,0,1,0.5,-0.5,-0.5,0.5\n" * 2, "expected times in s, ms, us"),
+        ("1 0 0 0 0 1 0 0 0 0 2 0\n" * 2, "pose 1: expected a rotation and a shift"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0\n" * 2, "expected a rotation and a shift"),
+        (1_100 * "1 " + "\n", "got 1100"),
+        (100_001 * "1 0 0 0 0 1 0 0 0 0 1 0\n", "expected 2 to 100000 waypoints, got 100001"),
+    ],
+)
+def test_a_file_that_is_no_trajectory_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "poses.txt"
+    file.write_text(text)
+    with pytest.raises(FileFormatError, match=message):
+        PathControl(path=str(file))
+
+
+def test_settings_of_trajectories_are_checked(tmp_path: Path) -> None:
+    file = tmp_path / "poses.txt"
+    file.write_text(trajectory("tum"))
+    with pytest.raises(InputError, match="axes: is about a trajectory"):
+        PathControl(path="orbit", axes="flu")
+    with pytest.raises(InputError, match="axes: is about a trajectory"):
+        PathControl(axes="flu").prepare(describe("mug", size=1.0))
+    for given in ([1, 2], "here", [1, 2, math.nan], [1, 2, "3"]):
+        with pytest.raises(InputError, match="object_at: expected three numbers"):
+            PathControl(path=str(file), object_at=given)
+    with pytest.raises(InputError, match="expected one of optical"):
+        PathControl(path=str(file), axes="body")
+    with pytest.raises(FileFormatError, match="is about the camera, and here the object moves"):
+        PathControl(path=str(file), moves="object")
+    with pytest.raises(InputError, match="seconds: the file"):
+        PathControl(path=str(file), seconds=3.0)
+    assert set(PathControl(path=f"{file}+orbit")._movers) == {"camera", "object"}

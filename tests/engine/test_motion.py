@@ -42,14 +42,16 @@ def levels(radiance: Tensor, like: Renderer) -> Tensor:
 
 
 @pytest.mark.parametrize("count", [1, 5, 16])
-@pytest.mark.parametrize(("shutter", "rolling"), [(0.1, 0.0), (0.0, 0.1), (0.03, 0.1), (0.1, 0.03)])
+@pytest.mark.parametrize(
+    ("shutter", "rolling"), [(0.1, 0.0), (0.0, 0.1), (0.03, 0.1), (0.1, 0.03), (0.0, -0.1), (0.03, -0.1)]
+)
 def test_every_row_is_exposed_around_its_own_time_and_as_long(shutter: float, rolling: float, count: int) -> None:
     offsets, rows, samples = moments_of(shutter, rolling, 20, count)
     torch.testing.assert_close(rows.sum(dim=0), torch.ones(20))
     assert (rows >= 0.0).all() and 0.0 < samples <= 1.0 and float(offsets.sum()) == pytest.approx(0.0, abs=1e-12)
     middle = (offsets[:, None] * rows).sum(dim=0)
     wanted = rolling * ((torch.arange(20) + 0.5) / 20 - 0.5)
-    half = (shutter + rolling) / count / 2.0
+    half = (shutter + abs(rolling)) / count / 2.0
     assert float((middle - wanted).abs().max()) <= half + 1e-7
     within = (offsets[:, None] - wanted).abs() <= shutter / 2.0 + half + 1e-7
     assert not rows[~within].any()
@@ -93,6 +95,21 @@ def test_rows_that_are_read_one_after_the_other_are_those_of_as_many_stills(
     assert float((levels(stills(0.9, 64, 5), rolled) - levels(rows, rolled)).abs().max()) > 20 * LEVELS
 
 
+def test_rows_that_are_read_from_the_bottom_are_those_of_a_picture_upside_down() -> None:
+    down, up = (compose([PathControl(**DRIVE, rolling=seconds)], describe("mug")) for seconds in (0.1, -0.1))
+    assert down.exposure == (0.0, 0.1) and up.exposure == (0.0, -0.1)
+    assert float(DRIVE.get("shutter", 0.0)) == 0.0
+    offsets, rows, samples = moments_of(0.0, 0.1, 12, 5)
+    other_offsets, other_rows, other_samples = moments_of(0.0, -0.1, 12, 5)
+    torch.testing.assert_close(other_offsets, offsets)
+    torch.testing.assert_close(other_rows, rows.flip(1))
+    assert samples == other_samples and float(other_rows[0].argmax()) > float(other_rows[-1].argmax())
+    first, last = (renderer([PathControl(**DRIVE, rolling=seconds)]).moments for seconds in (0.1, -0.1))
+    assert len(first) == len(last)
+    for one, other in zip(first, last, strict=True):
+        torch.testing.assert_close(other.rows, one.rows.flip(0))
+
+
 @pytest.mark.slow
 def test_fewer_moments_than_rows_are_close_to_it(stills: Callable[[float, int, int], Tensor]) -> None:
     rolled = renderer([PathControl(**DRIVE, rolling=0.1)])
@@ -113,7 +130,7 @@ def test_a_derivative_of_a_texture_is_that_of_the_mean() -> None:
     assert float(0.04 * gradient.double().sum()) == pytest.approx(float(above - below), rel=0.02)
 
 
-@pytest.mark.parametrize("given", [{"shutter": 0.0}, {"rolling": -1.0}, {"shutter": 61.0}, {"shutter": "long"}])
+@pytest.mark.parametrize("given", [{"shutter": 0.0}, {"rolling": -61.0}, {"shutter": 61.0}, {"shutter": "long"}])
 def test_times_that_no_shutter_has_are_refused(given: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match="expected a number over 0 and up to 60"):
+    with pytest.raises(InputError, match=r"expected a number (over 0 and up|from -60) to 60"):
         PathControl(**given)

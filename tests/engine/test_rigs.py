@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.errors import FileFormatError, InputError
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.scene.geometry import camera_to_world, middle
+from advsearch.scene.geometry import camera_to_world, middle, rotation
 from advsearch.scene.rig import read_rig
 from advsearch.tasks import make_task
 
@@ -163,3 +164,54 @@ def test_a_rig_and_its_task_belong_together(tmp_path: Path) -> None:
         advsearch.attack("car", model, camera=rig(tmp_path, STEREO), controls="texture", **SMALL)
     with pytest.raises(InputError, match="expected a rig, got one camera"):
         advsearch.attack("car", model, task="rig", controls="texture", **SMALL)
+
+
+# ---- scales of nerfstudio ---------------------------------------------------------------------------------------
+
+
+def transforms(folder: Path, factor: float, **entries: object) -> str:
+    """Three frames, the second 0.3 m to the right of the first, the third turned; positions times a scale."""
+    frames = []
+    for place, degrees in (([1.0, 2.0, 3.0], 0.0), ([1.3, 2.0, 3.0], 0.0), ([1.6, 2.0, 2.8], 8.0)):
+        pose = np.eye(4)
+        pose[:3, :3] = rotation(0.0, degrees, 0.0)
+        pose[:3, 3] = factor * np.array(place)
+        frames.append({"file_path": "a.png", "transform_matrix": pose.tolist()})
+    lens = {"camera_model": "OPENCV", "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 16.0, "w": 32, "h": 32}
+    (folder / "transforms.json").write_text(json.dumps({**lens, **entries, "frames": frames}))
+    return f"{folder / 'transforms.json'}#0,1,2"
+
+
+HALF_AND_TURNED = [[0.0, 0.5, 0.0, 9.0], [-0.5, 0.0, 0.0, 8.0], [0.0, 0.0, 0.5, 7.0]]
+
+
+@pytest.mark.parametrize(
+    ("scale", "entries"),
+    [
+        (1.0, {}),
+        (0.5, {"applied_scale": 0.5}),
+        (3.0, {"applied_scale": 3, "applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]]}),
+        (0.25, {"applied_scale": 0.5, "applied_transform": HALF_AND_TURNED}),
+        (0.5, {"applied_transform": [*HALF_AND_TURNED, [0.0, 0.0, 0.0, 1.0]]}),
+        (1.0, {"scale": 0.33, "offset": [0.5, 0.5, 0.5], "aabb_scale": 4}),  # what Instant NGP does when it reads it
+    ],
+)
+def test_frames_of_nerfstudio_are_as_far_apart_as_before_they_were_scaled(
+    tmp_path: Path, scale: float, entries: dict[str, object]
+) -> None:
+    mounts = read_rig(transforms(tmp_path, scale, **entries))
+    np.testing.assert_allclose(mounts[1].pose[:3, 3], [0.3, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(mounts[2].pose[:3, 3], [0.6, 0.0, 0.2], atol=1e-9)
+    assert mounts[0].model is not None and not mounts[0].model.told
+
+
+@pytest.mark.parametrize("scale", [0, -1.0, 1e-9, 1e9, "a", [1.0], True])
+def test_a_scale_that_is_none_is_refused(tmp_path: Path, scale: object) -> None:
+    with pytest.raises(FileFormatError, match="applied_scale: expected"):
+        read_rig(transforms(tmp_path, 1.0, applied_scale=scale))
+
+
+@pytest.mark.parametrize("rows", [[[1, 0, 0, 0]] * 3, [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]], "x", [[1.0]]])
+def test_a_transform_of_the_world_that_is_no_rotation_and_scale_is_refused(tmp_path: Path, rows: object) -> None:
+    with pytest.raises(FileFormatError, match="applied_transform: expected"):
+        read_rig(transforms(tmp_path, 1.0, applied_transform=rows))

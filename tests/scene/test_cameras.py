@@ -247,6 +247,166 @@ def test_a_file_that_is_no_camera_is_refused_in_a_sentence(what: str, tmp_path: 
     assert words in said and str(path) in said and "\n" not in said and len(said) < 700
 
 
+# ---- files of other tools -------------------------------------------------------------------------------------------
+
+BROWN = "fx: 902.5\nfy: 911.75\ncx: 645.25\ncy: 352.5\n"
+BROWN_NUMBERS = {"fx": 902.5 / 1280, "fy": 911.75 / 720, "cx": 645.75 / 1280, "cy": 353.0 / 720}
+BENT = dict(zip(("k1", "k2", "p1", "p2"), K, strict=True))
+
+
+def orbslam(camera: str, kind: str | None, *names: str) -> str:
+    """A settings file of ORB-SLAM, with what of it is about no lens."""
+    text = '%YAML:1.0\n\n#----\nFile.version: "1.0"\n' + (f'Camera.type: "{kind}"\n' if kind else "")
+    text += "".join(f"{camera}.{line}\n" for line in BROWN.splitlines())
+    text += "".join(f"{camera}.{name}: {value}\n" for name, value in zip(names, K, strict=False))
+    text += "Camera.width: 1280\nCamera.height: 720\nCamera.fps: 20.0\nCamera.RGB: 1\nThDepth: 35.0\n"
+    return text + "ORBextractor.nFeatures: 1200\nViewer.PointSize: 2\nIMU.NoiseGyro: 1.7e-04\n"
+
+
+METASHAPE = (
+    "<calibration>\n<projection>{kind}</projection><width>1280</width><height>720</height><f>911.75</f>"
+    "<cx>5.75</cx><cy>-7</cy><b1>-9.25</b1><b2>1.5</b2>{rest}<date>2026-11-28T00:00:00Z</date></calibration>"
+)
+KITTI = (
+    "P0: 902.5 0 645.25 0 0 911.75 352.5 0 0 0 1 0\nP1: 902.5 0 645.25 -386.1 0 911.75 352.5 0 0 0 1 0\n"
+    "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\nimage_width: 1280\nimage_height: 720\n"
+)
+KITTI_RAW = (
+    "calib_time: 09-Jan-2012 13:57:47\ncorner_dist: 9.950000e-02\nS_00: 1.28e+03 7.2e+02\n"
+    "K_00: 902.5 0 645.25 0 911.75 352.5 0 0 1\nD_00: -0.28 0.07 0.001 -0.002 0\nR_00: 1 0 0 0 1 0 0 0 1\n"
+    "T_00: 0 0 0\nS_rect_00: 1280 720\nR_rect_00: 1 0 0 0 1 0 0 0 1\n"
+    "P_rect_00: 902.5 0 645.25 0 0 911.75 352.5 0 0 0 1 0\n"
+)
+FOCAL = {"focal_x": 902.5 / 1280, "focal_y": 911.75 / 1280, "c_x": 5.75 / 1280, "c_y": -7 / 1280}
+OPENSFM = {"width": 1280, "height": 720, **FOCAL}
+REALSENSE = {"width": 1280, "height": 720, "fx": 902.5, "fy": 911.75, "ppx": 645.25, "ppy": 352.5}
+BY_COLUMNS = [902.5, 0.0, 0.0, 0.0, 911.75, 0.0, 645.25, 352.5, 1.0]
+RECTIFIED: dict[str, float] = {}
+FISH = dict(zip(("k1", "k2", "k3", "k4"), K, strict=True))
+OF_OTHER_TOOLS: dict[str, tuple[str, str, dict[str, float]]] = {
+    "orbslam2.yaml": (orbslam("Camera", None, "k1", "k2", "p1", "p2"), "brown-conrady", BENT),
+    "orbslam3.yaml": (orbslam("Camera1", "PinHole", "k1", "k2", "p1", "p2"), "brown-conrady", BENT),
+    "kb8.yaml": (orbslam("Camera1", "KannalaBrandt8", "k1", "k2", "k3", "k4"), "fisheye", FISH),
+    "rectified.yaml": (orbslam("Camera1", "Rectified"), "brown-conrady", RECTIFIED),
+    "stereo.yaml#Camera2": (
+        orbslam("Camera2", "KannalaBrandt8", "k1", "k2", "k3", "k4") + "Camera1.fx: 3\nCamera1.k1: 9\nStereo.b: 0.1\n",
+        "fisheye", FISH,
+    ),
+    "stella.yaml": (
+        "Camera: {name: c, setup: monocular, model: fisheye, fx: 902.5, fy: 911.75, cx: 645.25, cy: 352.5, "
+        f"k1: {K[0]}, k2: {K[1]}, k3: {K[2]}, k4: {K[3]}, fps: 30, cols: 1280, rows: 720, color_order: RGB}}\n",
+        "fisheye", FISH,
+    ),
+    "calib.txt#P0": (KITTI, "brown-conrady", RECTIFIED),
+    "calib.txt#P1": (KITTI, "brown-conrady", RECTIFIED),
+    "calib_cam_to_cam.txt#00": (KITTI_RAW, "brown-conrady", BENT),
+    "calib_cam_to_cam.txt#rect_00": (KITTI_RAW, "brown-conrady", RECTIFIED),
+    "opencv_stereo.yaml": (
+        f"image_size: [1280, 720]\nM1: {TABLE['matrix']}\nD1: {K}\nM2: {TABLE['matrix']}\n", "brown-conrady", BENT
+    ),
+    "realsense.json": (json.dumps({**REALSENSE, "model": "distortion.brown_conrady", "coeffs": [*K, 0.0]}),
+                       "brown-conrady", BENT),
+    "inverse.json": (json.dumps({**REALSENSE, "model": "Inverse Brown Conrady", "coeffs": [0.0] * 5}),
+                     "brown-conrady", RECTIFIED),
+    "t265.json": (json.dumps({**REALSENSE, "model": "kannala_brandt4", "coeffs": [*K, 0.0]}), "fisheye", FISH),
+    "open3d.json": (json.dumps({"width": 1280, "height": 720, "intrinsic_matrix": BY_COLUMNS}),
+                    "brown-conrady", RECTIFIED),
+    "arkit.json": (json.dumps({"imageResolution": [1280, 720], "intrinsics": [BY_COLUMNS[k:k + 3] for k in (0, 3, 6)]}),
+                   "brown-conrady", RECTIFIED),
+    "camera_models.json": (json.dumps({"v2 a b": {"projection_type": "brown", **OPENSFM, **BENT, "k3": 0.0}}),
+                           "brown-conrady", BENT),
+    "two.json#fish": (
+        json.dumps({"other": {"projection_type": "perspective", "width": 4, "height": 4, "focal": 1.0},
+                    "fish": {"projection_type": "fisheye_opencv", **OPENSFM, **FISH}}),
+        "fisheye", FISH,
+    ),
+    "metashape.xml": (
+        METASHAPE.format(kind="frame", rest="<k1>-0.28</k1><k2>0.07</k2><p1>-0.002</p1><p2>0.001</p2>"),
+        "brown-conrady", {**BENT, "skew": 1.5 / 1280},
+    ),
+    "metashape_fisheye.xml": (
+        METASHAPE.format(kind="fisheye", rest="<k1>-0.28</k1><k2>0.07</k2><k3>0.001</k3><k4>-0.002</k4>"),
+        "fisheye", {**FISH, "skew": 1.5 / 1280},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(OF_OTHER_TOOLS))
+def test_the_same_camera_in_files_of_other_tools(name: str, tmp_path: Path) -> None:
+    text, kind, numbers = OF_OTHER_TOOLS[name]
+    path = tmp_path / name
+    path.with_name(name.partition("#")[0]).write_text(text)
+    found = read_camera(str(path))
+    assert found.kind == kind and found.size == (720, 1280) and not [note for note in found.told if "M2" not in note]
+    assert found.values == pytest.approx({**dict.fromkeys(NUMBERS, 0.0), **BROWN_NUMBERS, **numbers})
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        (json.dumps({"a": {"projection_type": "spherical", "width": 100, "height": 50}}), "equirectangular"),
+        (METASHAPE.format(kind="spherical", rest=""), "equirectangular"),
+        ("Camera: {model: equirectangular, cols: 100, rows: 50}\n", "equirectangular"),
+    ],
+)
+def test_panoramas_of_other_tools(text: str, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / ("camera.json" if text.startswith("{") else "camera.xml")
+    path.write_text(text)
+    assert read_camera(str(path)).kind == kind
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("# Bundle file v0.3\n2 9\n500 0 0\n", "a Bundler reconstruction, .* 1 RADIAL WIDTH HEIGHT f"),
+        ("NVM_V3\n\n2\n", "VisualSFM"),
+        ("#polynomial coefficients for the DIRECT mapping function\n5 -1 0\n", "OCamCalib .*cv2.fisheye"),
+        ("[LEFT_CAM_HD]\nfx=700\nfy=700\n", "INI file, as of a ZED's .*write one section as YAML"),
+        ("extrinsic\n1 0 0 0\n", "MVSNet"),
+        ("<x:xmpmeta xmlns:x='adobe:ns:meta/'></x:xmpmeta>", "RealityCapture"),
+        ("<document version='1.2.0'><chunk/></document>", "Metashape's <document>, .* save the lens alone"),
+        (METASHAPE.format(kind="cylindrical", rest=""), "got 'cylindrical', a cylinder, another projection"),
+        (METASHAPE.format(kind="frame", rest="<k4>0.1</k4>"), "k4: expected 0, got 0.1"),
+        (METASHAPE.format(kind="frame", rest="<p3>0.1</p3>"), "expected no 'p3', got '0.1'"),
+        (METASHAPE.format(kind="fisheye", rest="<p1>0.1</p1>"), "expected no 'p2', got '0.1'"),
+        ("camera_model: mei\nimage_width: 9\nmirror_parameters: {xi: 1.2}\n", "got 'mei', the unified model"),
+        ("model_type: SCARAMUZZA\nimage_width: 9\n", "got 'scaramuzza', a polynomial of an angle"),
+        (ros("fov", [0.9]), "got 'fov', the FOV model, another projection"),
+        (ros("ftheta", [0.9]), "got 'ftheta', a polynomial"),
+        (ros("sphere of my own", [0.9]), "got 'sphere_of_my_own'; calibrate with one of these"),
+        ("cam0: {camera_model: omni, intrinsics: [1, 2, 3, 4, 5]}\n", "got omni, the unified model with a mirror"),
+        ("cam0: {camera_model: ds, intrinsics: [1, 2, 3, 4, 5, 6]}\n", "got ds, the double sphere model"),
+        ("cam0: {camera_model: eucm, intrinsics: [1, 2, 3, 4, 5, 6]}\n", "got eucm, the extended unified model"),
+        ("a: {projection_type: dual, width: 4, height: 4}\n", "got 'dual', a blend"),
+        ("a: {projection_type: fisheye624, width: 4, height: 4}\n", "got 'fisheye624', a fisheye with tangential"),
+        ("a: {projection_type: brown, width: .nan, height: 4}\n", "width: expected a finite number"),
+        ("a: {projection_type: brown, height: 4}\n", "width: expected a finite number"),
+        (json.dumps({**REALSENSE, "model": "Inverse Brown Conrady", "coeffs": K}), "got 'inverse_brown_conrady'"),
+        (KITTI.replace("image_width: 1280\n", ""), "has 2 cameras, P0, P1"),
+        ("P2: 7 0 6 0 0 7 3 0 0 0 1 0\n", "no size of the pictures; add it in two lines"),
+        ("P2: 7 0 6 0 0 7 3 0 0 0 1\nimage_width: 9\nimage_height: 9\n", "P2: expected 12 numbers"),
+        ("P2: 7 0 6 0 0 x 3 0 0 0 1 0\nimage_width: 9\nimage_height: 9\n", "P2: expected a finite number"),
+        ("K_00: 7 0 6 0 7 3 0 0 1\nS_00: 9 9\n", "D_00: expected 5 numbers"),
+        (orbslam("Camera1", "KannalaBrandt9"), "got 'kannalabrandt9'"),
+        (orbslam("Camera1", "PinHole") + "Camera2.fx: 3\n", "has 2 cameras, Camera1, Camera2"),
+        (orbslam("Camera1", "PinHole", "k1").replace("-0.28", "[1]"), "k1: expected a finite number"),
+    ],
+)  # fmt: skip
+def test_files_of_other_tools_that_are_not_read_are_named(text: str, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match=words) as caught:
+        read_camera(str(path))
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 700
+
+
+def test_what_is_not_read_of_files_of_other_tools_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(orbslam("Camera", "PinHole", "k1") + "Camera.newWidth: 640\nstrange: 1\n")
+    (note,) = read_camera(str(path)).told
+    assert "not read: 'newWidth', 'strange'." in note
+
+
 # ---- inside Mitsuba -------------------------------------------------------------------------------------------------
 
 

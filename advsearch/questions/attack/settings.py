@@ -130,7 +130,8 @@ class AttackConfig(DerivativeConfig):
         None, "search",
         "the path along which camera or object travel, with --over path; pictures of the adversarial scene along it "
         "are kept",
-        "approach, pass, orbit, a .csv file, or two of them, the camera's and the object's, as in approach+orbit; of "
+        "approach, pass, orbit, a .csv file or a trajectory (TUM, EuRoC, KITTI), or two of them, the camera's and the "
+        "object's, as in approach+orbit; of "
         "several with commas between them, one is drawn each time",
         otherwise="approach", min_length=1,
     )
@@ -139,8 +140,9 @@ class AttackConfig(DerivativeConfig):
         unit="seconds", gt=0.0, le=60.0,
     )
     rolling: float | None = setting(
-        None, "search", "how long the rows of a picture are read one after the other along a path (rolling shutter)",
-        otherwise="all at once", unit="seconds", gt=0.0, le=60.0,
+        None, "search",
+        "how long the rows of a picture are read one after the other along a path (rolling shutter), from the top; "
+        "below 0 from the bottom", otherwise="all at once", unit="seconds", ge=-60.0, le=60.0,
     )
     draws: int | None = setting(
         None, "search", "how many random conditions each step looks at, with --over",

@@ -1,0 +1,231 @@
+"""Trajectories of TUM, EuRoC and KITTI: poses of a sensor in a world, as text.
+
+    TUM     timestamp tx ty tz qx qy qz qw             seconds, blanks between the numbers
+    EuRoC   #timestamp [ns],p_RS_R_x [m],...,q_RS_w [],q_RS_x [],...   commas, real part first
+    KITTI   12 numbers: the pose (3, 4), row by row    no times: 10 poses a second
+
+A header names the columns, in any order; without one, 8 numbers are TUM's and 12 KITTI's. Which
+axes the sensor has and where the world's up is stands in none of these files.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from advsearch.errors import FileFormatError
+from advsearch.scene.assets import Doubles
+from advsearch.scene.importing.files import is_number, shown
+from advsearch.scene.importing.unread import join_names
+
+MAX_COLUMNS = 64
+MAX_ROWS = 100_000
+KITTI_RATE = 10.0  # poses a second
+QUATERNION_TOLERANCE = 0.01  # how far from 1 the length of a quaternion may be
+ROTATION_TOLERANCE = 1e-3
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+UNIT_BY_SIZE = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+"""The unit of times since 1970 that do not state it, by the least that they are."""
+
+POSITION = ("x", "y", "z")
+QUATERNION = ("qx", "qy", "qz", "qw")
+OWN_COLUMNS = {"time", *POSITION}  # of a table of waypoints, which is none of these formats
+TIME_NAME = re.compile(r"(time_?)?stamp|time|t|sec(ond)?s?")
+POSITION_NAME = re.compile(r"(?:t|p|p_\w+_|pos(?:ition)?[._]?|translation[._]?)?([xyz])")
+QUATERNION_NAME = re.compile(r"q(?:uat(?:ernion)?)?(?:_\w+)?[._]?([wxyz])|(?:rotation|orientation)[._]?([wxyz])")
+UNIT = re.compile(r"\[([^\]]*)\]")
+
+OPTICAL, UNUSED = "optical", "none"
+SENSOR_AXES: Mapping[str, Doubles] = {
+    OPTICAL: np.eye(3),
+    "opengl": np.diag([1.0, -1.0, -1.0]),
+    "flu": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+    "frd": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+    "euroc": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+}
+"""By name, what turns a camera's axes (x right, y down, z ahead) into those of the file's sensor."""
+AXES_MEAN: Mapping[str, str] = {
+    OPTICAL: "x right, y down, z ahead",
+    "opengl": "x right, y up, z back",
+    "flu": "x ahead, y left, z up",
+    "frd": "x ahead, y right, z down",
+    "euroc": "x up, y right, z ahead",
+    UNUSED: "not read: the camera looks at the object",
+}
+WORLD_TO_Z_UP: Mapping[str, Doubles] = {
+    "z": np.eye(3),
+    "-z": np.diag([1.0, -1.0, -1.0]),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "-y": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+}
+"""By what is up in the file's world, what turns it into one whose z is up."""
+
+
+class PoseFormat(Enum):
+    """A format of trajectories, with what its files are called in messages."""
+
+    TUM = "TUM's trajectory"
+    EUROC = "EuRoC's trajectory"
+    KITTI = "KITTI's poses"
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses from a file, as they stand in it, but for times in seconds."""
+
+    format: PoseFormat
+    times: Doubles | None  # (n,) seconds; None where the file has none
+    positions: Doubles  # (n, 3)
+    rotations: Rotation | None  # from the sensor's axes to the world's; None where the file has none
+    notes: tuple[str, ...]
+
+    @property
+    def default_up(self) -> str:
+        return "-y" if self.format is PoseFormat.KITTI else "z"
+
+    def orient(self, axes: str, up: str, origin: Sequence[float]) -> tuple[Doubles, Rotation | None]:
+        """Return positions (n, 3) from an origin, and rotations from a camera's axes (x right, y down, z ahead), both
+        in a world whose z is up; no rotations where the axes are `UNUSED` or the file has none."""
+        world = Rotation.from_matrix(WORLD_TO_Z_UP[up])
+        positions = world.apply(self.positions - np.asarray(origin, np.float64))
+        if axes == UNUSED or self.rotations is None:
+            return positions, None
+        return positions, world * self.rotations * Rotation.from_matrix(SENSOR_AXES[axes])
+
+
+def read_trajectory(path: Path, text: str) -> Trajectory | None:
+    """Return the poses in the text of a file, or None where it is in none of the formats.
+
+    Raises FileFormatError: rows of different lengths, numbers that are not finite, quaternions that are not of length
+    1, matrices that are no rotations, or a table of numbers whose columns are not known.
+    """
+    lines = [line.strip() for line in text.splitlines()]
+    lines = [line for line in lines if line]
+    first = next((row for row, line in enumerate(lines) if _is_row(line)), None)
+    if first is None:
+        return None
+    leading = [_split(line.lstrip("#").strip()) for line in lines[:first]]
+    is_own = any(OWN_COLUMNS <= set(words) for words in leading) and not any(map(_find_columns, leading))
+    rows = [_split(line) for line in lines[first:] if not line.startswith("#")]
+    headers = [words for words in leading if _find_columns(words)]
+    if is_own or (not headers and "," in lines[first] and leading):
+        return None  # a table with a head of another kind
+    if len(rows) > MAX_ROWS:
+        raise FileFormatError(f"{path}: expected 2 to {MAX_ROWS} waypoints, got {len(rows)}")
+    if headers:
+        return _read_named_columns(path, headers[-1], rows, "," in lines[first])
+    if "," in lines[first]:
+        raise FileFormatError(
+            f"{path}: expected a first line that names the columns, got numbers; add time,x,y,z, or that of EuRoC's "
+            "files: #timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+        )
+    count = len(rows[0])
+    if count == 8:
+        return _read_named_columns(path, ["timestamp", "tx", "ty", "tz", *QUATERNION], rows, False)
+    if count == 12:
+        return _read_kitti(path, rows)
+    known = " (KITTI-360's first column is a number of a picture; leave it out)" if count in (13, 17) else ""
+    raise FileFormatError(
+        f"{path}: expected 8 numbers a line as TUM's timestamp tx ty tz qx qy qz qw, or 12 as KITTI's poses, got "
+        f"{count}{known}"
+    )
+
+
+def _split(line: str) -> list[str]:
+    return [word.strip() for word in line.split(",")] if "," in line else line.split()
+
+
+def _is_row(line: str) -> bool:
+    return not line.startswith("#") and all(map(is_number, _split(line)))
+
+
+def _find_columns(names: Sequence[str]) -> dict[str, int]:
+    """Return the columns by our names for them, or nothing unless there are a time, a position and either a quaternion
+    or a name that only these formats have."""
+    if not 4 <= len(names) <= MAX_COLUMNS:
+        return {}
+    columns = dict[str, int]()
+    for index, name in enumerate(names):
+        plain = UNIT.sub("", name).strip().lower()
+        if TIME_NAME.fullmatch(plain):
+            column = "time"
+        elif match := POSITION_NAME.fullmatch(plain):
+            column = match[1]
+        elif match := QUATERNION_NAME.fullmatch(plain):
+            column = f"q{match[1] or match[2]}"
+        else:
+            continue
+        if column in columns:
+            return {}
+        columns[column] = index
+    has_quaternion = set(QUATERNION) <= set(columns)
+    if not {"time", *POSITION} <= set(columns) or (not has_quaternion and set(QUATERNION) & set(columns)):
+        return {}
+    is_own = not has_quaternion and OWN_COLUMNS <= set(names)
+    return {} if is_own else columns
+
+
+def _read_table(path: Path, rows: Sequence[Sequence[str]], count: int) -> Doubles:
+    for row in rows:
+        if len(row) != count or not all(map(is_number, row)):
+            raise FileFormatError(f"{path}: expected {count} numbers in each row, got {shown(' '.join(row))}")
+    table = np.array(rows, dtype=object).astype(np.float64)
+    if not np.isfinite(table).all():
+        raise FileFormatError(f"{path}: expected finite numbers, got others")
+    return np.asarray(table, np.float64)
+
+
+def _read_named_columns(
+    path: Path, names: Sequence[str], rows: Sequence[Sequence[str]], has_commas: bool
+) -> Trajectory:
+    columns = _find_columns(names)
+    table = _read_table(path, rows, len(names))
+    unread = [name for index, name in enumerate(names) if index not in columns.values()]
+    notes = [f"{path}: not read: {join_names(unread)}."] if unread else []
+
+    times = table[:, columns["time"]]
+    stated = UNIT.search(names[columns["time"]])
+    unit = stated[1].strip() if stated else "s"
+    if unit not in UNITS:
+        raise FileFormatError(
+            f"{path}: expected times in {', '.join(UNITS)}, got {shown(unit)}; correct the first line"
+        )
+    if not stated:
+        unit = next((unit for least, unit in UNIT_BY_SIZE if abs(times[0]) >= least), "s")
+        if unit != "s":
+            notes.append(f"{path}: its times do not state a unit; by their size they are read as {unit}.")
+    # differences first: a time since 1970 in nanoseconds has more digits than a float
+    times = (times - times[0]) * UNITS[unit]
+
+    positions = table[:, [columns[name] for name in POSITION]]
+    rotations = None
+    if "qw" in columns:
+        quaternions = table[:, [columns[name] for name in QUATERNION]]
+        lengths = np.linalg.norm(quaternions, axis=1)
+        off = np.abs(lengths - 1.0)
+        if off.max() > QUATERNION_TOLERANCE:
+            worst = int(off.argmax())
+            raise FileFormatError(
+                f"{path}: pose {worst + 1}: expected a quaternion of length 1, got one of {lengths[worst]:.3g}"
+            )
+        rotations = Rotation.from_quat(quaternions)
+    known = PoseFormat.EUROC if has_commas else PoseFormat.TUM
+    return Trajectory(known, times, positions, rotations, tuple(notes))
+
+
+def _read_kitti(path: Path, rows: Sequence[Sequence[str]]) -> Trajectory:
+    poses = _read_table(path, rows, 12).reshape(-1, 3, 4)
+    turns = poses[:, :, :3]
+    off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    off = np.where(np.linalg.det(turns) > 0.0, off, np.inf)
+    if off.max() > ROTATION_TOLERANCE:
+        raise FileFormatError(
+            f"{path}: pose {int(off.argmax()) + 1}: expected a rotation and a shift (3 rows of 4), got another map"
+        )
+    return Trajectory(PoseFormat.KITTI, None, poses[:, :, 3], Rotation.from_matrix(turns), ())
