@@ -79,19 +79,22 @@ def left_over(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
 class Place:
     """What is to be found in a picture, the truth of detection: indices of the right classes, and the smallest box
     round what is seen of the object, x0, y0, x1, y1 in pixels, or None. Size: (height, width) of the picture in
-    pixels."""
+    pixels. And the boxes round what is seen of other things with one of these classes."""
 
     labels: Labels
     box: tuple[int, int, int, int] | None
     size: tuple[int, int]
+    others: tuple[tuple[int, int, int, int], ...] = ()
 
     @property
     def shares(self) -> Tensor | None:
         """The box as shares of width and height, (4,)."""
-        if self.box is None:
-            return None
+        return None if self.box is None else self.fractions_of(self.box)
+
+    def fractions_of(self, box: tuple[int, int, int, int]) -> Tensor:
+        """Return a box in pixels as fractions of width and height, (4,)."""
         height, width = self.size
-        return torch.tensor(self.box) / torch.tensor([width, height, width, height])
+        return torch.tensor(box) / torch.tensor([width, height, width, height])
 
 
 def overlap_with(one: Detections, truth: Place) -> Tensor:
