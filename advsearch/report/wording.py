@@ -58,12 +58,12 @@ PROBABILITY_DECIMALS = 1  # Of a probability that a model gives
 WHOLE = ("background", "itself", "something else")  # Labels without an article
 _OUTCOMES = {
     Outcome.MISSED: "missed",
-    Outcome.LOOSE: "in a loose box",
+    Outcome.LOOSE: "loose",
     Outcome.WRONG_CLASS: "of another class",
     Outcome.PHANTOM: "elsewhere",
 }
 """What a count of each is called, the usual ones first."""
-_OUTCOMES_OF_PIXELS = _OUTCOMES | {Outcome.LOOSE: "in part"}
+_LOOSELY = {DETECTION: "in a loose box", SEGMENTATION: "in part"}
 _DOING = {"calls": "calling", "finds": "finding", "sees": "seeing", "takes": "taking", "judges": "judging"}
 _DOING |= {"predicts": "predicting", "commands": "commanding"}
 
@@ -234,7 +234,7 @@ def calls(task: str, thing: str, label: str, outcome: Outcome | None = None) -> 
     if outcome is Outcome.MISSED:
         return f"finds {label}"
     if outcome is Outcome.LOOSE:
-        return f"sees {thing}, but {'in a loose box' if task == DETECTION else 'only in part'}"
+        return f"sees {thing}, but {'only in part' if task == SEGMENTATION else 'in a loose box'}"
     if outcome is Outcome.PHANTOM:
         return f"sees {with_article(label)}, and none where {thing} is"
     if task == CLASSIFICATION:
@@ -254,10 +254,10 @@ def calling(task: str, label: str, outcome: Outcome | None = None) -> str:
     return f"{_DOING[verb]} {rest.removesuffix(' for it')}"
 
 
-def outcomes_text(outcomes: Mapping[str, int] | None, task: str = DETECTION) -> str:
+def outcomes_text(outcomes: Mapping[str, int] | None, task: str = "") -> str:
     """Return how often each outcome came about that is not right: ``12 missed, 6 in a loose box``; empty where nothing
     is known of them."""
-    names = _OUTCOMES_OF_PIXELS if task == SEGMENTATION else _OUTCOMES
+    names = _OUTCOMES | ({Outcome.LOOSE: _LOOSELY[task]} if task in _LOOSELY else {})
     counts = ((name, (outcomes or {}).get(outcome.value, 0)) for outcome, name in names.items())
     return ", ".join(f"{number} {name}" for name, number in counts if number)
 

@@ -16,6 +16,9 @@ FORMS = ("xyxy", "xywh", "cxcywh", "yxyx")
 """How a box may be given: corners; a corner or the middle with width and height; corners with y first."""
 
 SMALLEST = 1e-6  # scores and overlaps below this, or as near to 1, count as this: log-odds of 13.8
+LEAST_OVERLAP = 0.1
+"""Least intersection over union of a box that is on the object at all (TIDE's threshold of the background)."""
+
 AMONG = 500  # among how many of the best scores boxes are looked for
 
 MOST = 2000

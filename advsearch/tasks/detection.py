@@ -25,6 +25,7 @@ from advsearch.tasks.base import Facts, Mark, Prediction, Said
 from advsearch.tasks.boxes import (
     FORMS,
     KNOWN,
+    LEAST_OVERLAP,
     SMALLEST,
     UNITS,
     Detections,
@@ -55,9 +56,6 @@ GOALS = {
 
 MOST, LEAST = 8, 0.1
 """Most boxes that are kept of a picture; the least score of one, and of one that is suppressed."""
-
-LEAST_OVERLAP = 0.1
-"""Least intersection over union of a box that is on the object at all (TIDE's threshold of the background)."""
 
 ON_IT = 0.5  # fraction of a box from which on it is on the object, however little it overlaps
 

@@ -154,7 +154,8 @@ def test_what_a_detector_does_follows_its_outcome(task: str, label: str, outcome
 
 def test_outcomes_are_counted_in_words() -> None:
     counts = {"loose": 4, "missed": 9, "phantom": 1, "wrong class": 2}
-    assert outcomes_text(counts) == "9 missed, 4 in a loose box, 2 of another class, 1 elsewhere"
+    assert outcomes_text(counts, "detection") == "9 missed, 4 in a loose box, 2 of another class, 1 elsewhere"
+    assert outcomes_text(counts) == "9 missed, 4 loose, 2 of another class, 1 elsewhere"
     assert outcomes_text({"loose": 4}, "segmentation") == "4 in part"
     assert outcomes_text(None) == "" and outcomes_text({}) == ""
     assert get_only_outcome({"loose": 4}) is Outcome.LOOSE

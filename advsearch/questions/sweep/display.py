@@ -365,6 +365,7 @@ def drive_rows(one: DriveRates) -> list[tuple[str, str, str, str]]:
         ("longest gap", one.longest_gap, " s", ""),
         ("changes a second", one.flicker, "", ""),
         ("frames without its track", tracks.lost if tracks else None, " %", ""),
+        ("frames with a loose track instead", tracks.loose if tracks else None, " %", ""),
         ("identity switches", tracks.switches if tracks else None, "", ""),
         ("longest gap of its track", tracks.longest_gap if tracks else None, " s", ""),
     ]
