@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field, fields
+from enum import Enum
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -156,6 +158,39 @@ NOT_A_NUMBER = "not a number"  # what an output of a model is called that has Na
 OUT_OF_VIEW = "out of view"
 """What a prediction is called where nothing of what is judged is in the picture. It is not a success of a search, and
 no share of right predictions counts it."""
+
+
+class Outcome(Enum):
+    """What becomes of the object in a detector's boxes, or in a segmentation's pixels.
+
+    The types of errors of TIDE (Bolya et al. 2020, section 2.2), as one object meets them. The value is what JSON
+    holds. Every count and every sentence about a detector draws from this, and none from the text of a prediction.
+    """
+
+    FOUND = "found"  # a right box
+    LOOSE = "loose"  # a box of the right class on the object, which overlaps it too little; of pixels, too few
+    WRONG_CLASS = "wrong class"  # a good box of another class
+    PHANTOM = "phantom"  # a box of the class away from the object, or where nothing of it is to be seen
+    MISSED = "missed"  # no box that counts
+
+
+OUTCOME = "outcome"  # under which a payload has the value of one
+
+
+def get_outcome(payload: object) -> Outcome | None:
+    """Return the outcome that the payload of a prediction states; None where it states none."""
+    value = payload.get(OUTCOME) if isinstance(payload, Mapping) else None
+    try:
+        return Outcome(value)
+    except (TypeError, ValueError):
+        return None
+
+
+def count_outcomes(payloads: Iterable[object]) -> dict[str, int] | None:
+    """Count the outcomes of predictions that are not right, by value; None where no payload states one."""
+    counts = Counter(get_outcome(payload) for payload in payloads)
+    named = {outcome.value: counts[outcome] for outcome in Outcome if counts[outcome]}
+    return named or None
 
 
 def rounded(number: float) -> str:

@@ -60,6 +60,7 @@ def observed(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
             column = column.cat.set_categories(sorted(column.unique()))
         if column.nunique() > 1 and not column.isna().any():
             table[name], units[name] = column, "" if is_names else rows.attrs["units"][name]
+    table |= {"outcome": rows["outcome"]} if "outcome" in rows and "outcome" not in table else {}
     found = pd.DataFrame({**table, "correct": rows["correct"] == 1, "unit": rows["unit"]})
     found.attrs["units"] = units
     return found

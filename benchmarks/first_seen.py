@@ -12,8 +12,11 @@ within the car.
 
     python benchmarks/first_seen.py --simulated 600
 
-draws so many tables from curves that are known, and counts how often the curve's interval has the truth. Nothing is
-rendered.
+draws so many tables from curves that are known, and counts how often the curve's interval has the truth, and how often
+a table of a falling or level curve is said not to fall. Nothing is rendered.
+
+A cell with `3+4/8` has 3 right pictures of 8, and 4 with a loose box. Where the share is shown not to fall with the
+distance, no curve is fitted.
 """
 
 from __future__ import annotations
@@ -29,7 +32,9 @@ import torch
 from torch.nn.functional import max_pool2d
 
 import advsearch
-from advsearch.questions.sweep.display import distance_of, distance_sentence
+from advsearch.options import Outcome
+from advsearch.questions.sweep.display import distance_of, distance_sentence, find_dips
+from advsearch.questions.sweep.summary import AxisRow
 
 SECONDS_MOST, F_NUMBER, READ = 1.0 / 30.0, 2.0, 3.0
 """Of the camera: the longest exposure, the lens, and electrons of noise in the dark."""
@@ -106,6 +111,20 @@ def simulated(distances: Sequence[float], draws: int, tables: int) -> None:
         share = 1.0 / (1.0 + (np.asarray(distances) / place) ** slope)
         ends = [half_right(distances, rng.binomial(draws, share).tolist(), draws)[1:] for _ in range(tables)]
         print(f"half at {place:g} m, slope {slope:g}: {np.mean([low <= place <= high for low, high in ends]):.1%}")
+    falling = 1.0 / (1.0 + (np.asarray(distances) / 20.0) ** 4)
+    curves = {"falling": falling, **{f"level at {share}": np.full(len(distances), share) for share in (0.1, 0.5, 0.9)}}
+    for name, share in curves.items():
+        alarms = 0
+        for _ in range(tables):
+            dips = find_dips(distances, rng.binomial(draws, share), np.full(len(distances), draws))
+            alarms += any(dip.is_shown for dip in dips)
+        print(f"{name}: said not to fall in {alarms / tables:.1%}")
+
+
+def count_cell(row: AxisRow) -> str:
+    """Return how many pictures are right, and with a plus how many have a loose box: ``3+4/8``."""
+    loose = (row.outcomes or {}).get(Outcome.LOOSE.value, 0)
+    return f"{row.correct}{f'+{loose}' if loose else ''}/{row.configurations}"
 
 
 def settings(light: Light, distance: float | None = None) -> dict[str, Any]:
@@ -162,9 +181,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             seen = distance_of(summary)
             said = "-" if seen is None else distance_sentence(seen)
             look = ", ".join(f"{one:.0f}" for one in levels(light, args.look, args.size))
-            half, low, high = half_right(distances, [row.correct for row in rows], args.draws)
-            cells = [name, summary.model, *(f"{row.correct}/{row.configurations}" for row in rows)]
-            print(f"| {' | '.join([*cells, f'{half:.0f} m, {low:.0f} to {high:.0f}', said, look])} |", flush=True)
+            curve = "does not fall"
+            if seen is None or seen.is_monotone:
+                half, low, high = half_right(distances, [row.correct for row in rows], args.draws)
+                curve = f"{half:.0f} m, {low:.0f} to {high:.0f}"
+            cells = [name, summary.model, *map(count_cell, rows)]
+            print(f"| {' | '.join([*cells, curve, said, look])} |", flush=True)
         print(f"{name}: {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
     return 0
 

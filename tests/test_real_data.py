@@ -71,7 +71,7 @@ def test_a_real_detector_and_a_real_segmenter_are_fooled(case: str, real_data: P
     assert (tmp_path / "run" / "images" / "adversarial-prediction.png").is_file()
 
 
-ELSEWHERE = {"displace": {"cup elsewhere"}, "create": {"dining table elsewhere"}}
+ELSEWHERE = {"displace": {"cup elsewhere", "cup in a loose box"}, "create": {"dining table elsewhere"}}
 """By objective: what the detector sees then, of a mug that stands on a table and which it sees where it is before."""
 
 

@@ -16,7 +16,7 @@ from advsearch.attacks import SampleCount, SearchResult, Trials, Verification, c
 from advsearch.attacks.candidates import Bracket
 from advsearch.engine.transport import PredictedSearch
 from advsearch.interrupts import interruptible
-from advsearch.options import NOT_A_NUMBER, Value
+from advsearch.options import NOT_A_NUMBER, Value, count_outcomes
 from advsearch.progress import Progress
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
@@ -142,12 +142,16 @@ def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judge
     """Return a rate with the predictions of its successes and the mean score of those that are a number."""
     labels = dict(Counter(trial.prediction.label for trial in successes).most_common())
     margin, counted = 0.0 - mean_number(trial.score for trial in trials), _counted(rate, trials)
-    return VerifiedRate(successes=rate.successes, spp=rate.spp, labels=labels, margin=margin, **counted)
+    outcomes = count_outcomes(trial.payload for trial in successes)
+    return VerifiedRate(
+        successes=rate.successes, spp=rate.spp, labels=labels, outcomes=outcomes, margin=margin, **counted
+    )
 
 
 def control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
     right = count_right(trials, spp)
-    return ControlGroup(correct=right.successes, **_counted(right, trials))
+    outcomes = count_outcomes(trial.payload for trial in trials if not trial.right)
+    return ControlGroup(correct=right.successes, outcomes=outcomes, **_counted(right, trials))
 
 
 def _counted(rate: Trials, trials: Sequence[Judgement]) -> dict[str, Any]:

@@ -293,10 +293,13 @@ def facts_about(
             return Facts(name, label, description.object.label, numbers, sight)
         return Facts(mesh, label, things[mesh].label, numbers, sight)
 
-    if judge != ALL:
-        return of(judge, label)
-    each = {OBJECT: of(OBJECT, label), **{mesh: of(mesh, None) for mesh in things}}
-    return replace(each[OBJECT], each=each)
+    labelled = OBJECT if judge == ALL else judge
+    each = {mesh: of(mesh, label if mesh == labelled else None) for mesh in (OBJECT, *things)}
+    each = {
+        mesh: replace(judged, others=tuple(other for name, other in each.items() if name != mesh))
+        for mesh, judged in each.items()
+    }
+    return replace(each[OBJECT], each=each) if judge == ALL else each[judge]
 
 
 def sight_of(surfaces: Surfaces, mesh: str = OBJECT, metres: float | None = None) -> Sight:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from advsearch.options import NOT_A_NUMBER
+from advsearch.options import NOT_A_NUMBER, Outcome, get_outcome
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _MARKS = {
 }
 _WANTED = {
     "mislabel": "makes the model take {} for something else",
-    "displace": "makes the model see {} elsewhere",
+    "displace": "makes the model see {} elsewhere or in a loose box",
     "create": "makes the model see beside {} what is not there",
     "nearer": "makes the model judge {} nearer than it is",
     "farther": "makes the model judge {} farther than it is",
@@ -56,7 +56,14 @@ _UNITS = {
 MOST_DECIMALS = 4  # Of a percentage
 PROBABILITY_DECIMALS = 1  # Of a probability that a model gives
 WHOLE = ("background", "itself", "something else")  # Labels without an article
-_NONE, _ELSEWHERE = "no ", " elsewhere"
+_OUTCOMES = {
+    Outcome.MISSED: "missed",
+    Outcome.LOOSE: "loose",
+    Outcome.WRONG_CLASS: "of another class",
+    Outcome.PHANTOM: "elsewhere",
+}
+"""What a count of each is called, the usual ones first."""
+_LOOSELY = {DETECTION: "in a loose box", SEGMENTATION: "in part"}
 _DOING = {"calls": "calling", "finds": "finding", "sees": "seeing", "takes": "taking", "judges": "judging"}
 _DOING |= {"predicts": "predicting", "commands": "commanding"}
 
@@ -164,8 +171,14 @@ def prediction_cells(task: str, prediction: Said) -> list[str]:
                 similar += f", right one at rank {kept['rank']} of {kept['references']}"
         return [label, similar]
     if task == DETECTION:
-        if label.startswith(_NONE):
-            return [f"{label} found", f"best score of {label.removeprefix(_NONE)} {share:.2f}"]
+        payload = getattr(prediction, "payload", None)
+        outcome = get_outcome(payload)
+        stated = payload if isinstance(payload, dict) else {}
+        if outcome is Outcome.MISSED:
+            return [f"{label} found", f"best score of {stated.get('class', 'it')} {share:.2f}"]
+        overlap = stated.get("iou")
+        if outcome is Outcome.LOOSE and isinstance(overlap, float):
+            return [label, f"score {share:.2f}, overlap {overlap:.2f}"]
         return [label, f"score {share:.2f}"]
     return [label, f"accuracy {percent(share)}" if task == SEGMENTATION else percent(share, PROBABILITY_DECIMALS)]
 
@@ -173,10 +186,12 @@ def prediction_cells(task: str, prediction: Said) -> list[str]:
 def prediction_text(task: str, prediction: Said) -> str:
     """Return a prediction on one line: ``vase, 91 %``, ``no cup found (best score of cup 0.12)``."""
     label, number = prediction_cells(task, prediction)
-    if task == SEGMENTATION and number and label.startswith(_NONE):
-        return f"{label} found, accuracy over the object's pixels {percent(prediction.probability)}"
     if task == SEGMENTATION and number:
-        return f"accuracy over the object's pixels {percent(prediction.probability)}, most often {label}"
+        accuracy = f"accuracy over the object's pixels {percent(prediction.probability)}"
+        outcome = get_outcome(getattr(prediction, "payload", None))
+        if outcome is Outcome.MISSED:
+            return f"{label} found, {accuracy}"
+        return f"{label}, {accuracy}" if outcome is Outcome.LOOSE else f"{accuracy}, most often {label}"
     if task == DETECTION and number:
         return f"{label} ({number})"
     return f"{label}, {number}" if number else label
@@ -211,14 +226,17 @@ def seen_text(task: str, prediction: Said) -> str:
     return f"{label} ({number})" if task == DETECTION and number else f"{label} {number}".rstrip()
 
 
-def calls(task: str, thing: str, label: str) -> str:
-    """Return what a model does to a thing, as a clause: ``calls this mug a vase``, ``finds no cup``."""
+def calls(task: str, thing: str, label: str, outcome: Outcome | None = None) -> str:
+    """Return what a model does to a thing, as a clause: ``calls this mug a vase``, ``finds no cup``; of a detector by
+    what becomes of the thing."""
     if label == NOT_A_NUMBER:
         return f"predicts nothing for {thing}, for its output is not a number"
-    if task in (SEGMENTATION, DETECTION) and label.startswith(_NONE):
+    if outcome is Outcome.MISSED:
         return f"finds {label}"
-    if task == DETECTION and label.endswith(_ELSEWHERE):
-        return f"sees {with_article(label.removesuffix(_ELSEWHERE))} where there is none"
+    if outcome is Outcome.LOOSE:
+        return f"sees {thing}, but {'only in part' if task == SEGMENTATION else 'in a loose box'}"
+    if outcome is Outcome.PHANTOM:
+        return f"sees {with_article(label)}, and none where {thing} is"
     if task == CLASSIFICATION:
         return f"calls {thing} {with_article(label)}"
     if task == COMMAND:
@@ -230,10 +248,23 @@ def calls(task: str, thing: str, label: str) -> str:
     return f'predicts "{label}" for {thing}'
 
 
-def calling(task: str, label: str) -> str:
+def calling(task: str, label: str, outcome: Outcome | None = None) -> str:
     """Return the same of a thing that was named already: ``calling it a vase``, ``finding no cup``."""
-    verb, _, rest = calls(task, "it", label).partition(" ")
+    verb, _, rest = calls(task, "it", label, outcome).partition(" ")
     return f"{_DOING[verb]} {rest.removesuffix(' for it')}"
+
+
+def outcomes_text(outcomes: Mapping[str, int] | None, task: str = "") -> str:
+    """Return how often each outcome came about that is not right: ``12 missed, 6 in a loose box``; empty where nothing
+    is known of them."""
+    names = _OUTCOMES | ({Outcome.LOOSE: _LOOSELY[task]} if task in _LOOSELY else {})
+    counts = ((name, (outcomes or {}).get(outcome.value, 0)) for outcome, name in names.items())
+    return ", ".join(f"{number} {name}" for name, number in counts if number)
+
+
+def get_only_outcome(outcomes: Mapping[str, int] | None) -> Outcome | None:
+    """Return the outcome of all of some predictions; None where they have several, or nothing is known of them."""
+    return get_outcome({"outcome": next(iter(outcomes))}) if outcomes and len(outcomes) == 1 else None
 
 
 NO_INTERVAL = "no interval"

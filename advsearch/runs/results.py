@@ -136,6 +136,12 @@ class RunResult(Result):
 Payload = Annotated[JsonValue, BeforeValidator(lambda value: plain(value))]
 """What a task keeps of a prediction beside its words."""
 
+Outcomes = dict[str, int] | None
+"""How often each of `options.Outcome` came about, by its value."""
+
+WHAT_BECOMES = "[what becomes of the object](tasks.md#what-becomes-of-the-object)"
+ONLY_OF_BOXES = "absent but for detection and segmentation"
+
 
 class SceneResult(RunResult):
     """The result of a command about one object, one model and one task."""
@@ -401,6 +407,7 @@ class ControlGroup(Fields):
     rate: float
     interval: Interval
     not_a_number: int = Field(default=0, description="trials whose output is NaN or infinity; absent without")
+    outcomes: Outcomes = optional(f"{WHAT_BECOMES} in those that are not right; {ONLY_OF_BOXES}")
 
 
 class VerifiedRate(Fields):
@@ -412,6 +419,7 @@ class VerifiedRate(Fields):
     interval: Interval
     spp: int = Field(description="samples a pixel")
     labels: dict[str, int] = Field(description="predictions of the successes, and how often each was given")
+    outcomes: Outcomes = optional(f"{WHAT_BECOMES} in the successes; {ONLY_OF_BOXES}")
     margin: JsonFloat = Field(
         description="mean over these trials, below 0 in a success, in logits; of a detector in log-odds"
     )

@@ -18,7 +18,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from advsearch.errors import FileFormatError
-from advsearch.options import NOT_A_NUMBER
+from advsearch.options import NOT_A_NUMBER, Outcome, get_outcome
 from advsearch.runs.export import as_columns, as_record, each_value
 from advsearch.runs.store import NAME, Row, Store
 
@@ -80,15 +80,24 @@ def units_of(store: Store) -> Units | None:
     raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}")
 
 
+def count_wrong_outcomes(rows: pd.DataFrame) -> dict[str, int] | None:
+    """Count the outcomes of rows of a frame that are not right; None where they have none."""
+    if "outcome" not in rows:
+        return None
+    counts = rows.loc[rows["correct"] != 1, "outcome"].astype(str).value_counts()
+    named = {one.value: int(counts[one.value]) for one in Outcome if one.value in counts}
+    return named or None
+
+
 KIND = "sweep"  # rows of the sweep itself
 EDGES = "parts of ranges"
 """The note of a run that says where the range of each drawn parameter is cut: the ends of the parts, by name."""
 
-SAID = ("id", "step", "correct", "margin", "probability", "seconds", "label")
+SAID = ("id", "step", "correct", "margin", "probability", "seconds", "label", "outcome")
 """Columns of a sweep's frame before those of its parameters; `unit` is the last one."""
 
 AT_ONCE = 10_000  # rows that become numbers and names at once, so that a million rows fit
-TAKEN = {*(one.name for one in fields(Row)), "unit"}  # names that a parameter cannot have in a frame
+TAKEN = {*(one.name for one in fields(Row)), "unit", "outcome"}  # names that a parameter cannot have in a frame
 
 
 def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
@@ -125,8 +134,9 @@ def sweep_frame(rows: Iterable[Row], also: Callable[[Row], Mapping[str, float]] 
     """Return rows of a sweep as a frame: `SAID`, a column for each parameter and for what is `also` told of a row, and
     `unit`, which here is the step.
 
-    Numbers are float64, NaN where a row has none; `correct` is 1 or 0, NaN where it was not judged. `label`, and
-    parameters that have a name anywhere, are categories in the order in which they come, "none" where a row has
+    Numbers are float64, NaN where a row has none; `correct` is 1 or 0, NaN where it was not judged. `label`, `outcome`
+    (of `options.Outcome`, "" where a row has none) and parameters that have a name anywhere are categories in the order
+    in which they come, "none" where a row has
     nothing. ``camera.target[0]`` is one of several numbers; ``attrs["units"]`` has the units of parameters.
     """
     units, parts = dict[str, str](), list[pd.DataFrame]()
@@ -147,7 +157,8 @@ def _cells(row: Row, number: int, units: dict[str, str]) -> dict[str, Any]:
     """What is known of a row, the `number`-th, by column; `units` gets those of its parameters."""
     said = row.id or number, row.step, row.correct, row.margin, row.probability, row.seconds
     label = row.label or ("" if row.correct is None else NOT_A_NUMBER)
-    cells: dict[str, Any] = dict(zip(SAID, (*said, label), strict=True))
+    outcome = get_outcome(row.payload)
+    cells: dict[str, Any] = dict(zip(SAID, (*said, label, "" if outcome is None else outcome.value), strict=True))
     for name, described in row.values.items():
         called = f"parameter {name}" if name in TAKEN else name
         for place, value, unit in each_value({called: described}):

@@ -143,6 +143,7 @@ class Facts:
         describe: the numbers of the configuration by parameter ("pose.yaw"), in the units that rows have.
         look: says what is seen in the picture, see `mask` and `depth`; None where no configuration is meant.
         each: the facts of each thing that is judged, by name, the object first; empty where it is one thing alone.
+        others: the facts of every other thing in the scene, the object included where a thing is judged.
         views: the facts in the picture of each camera of a rig; empty of one camera.
     """
 
@@ -152,6 +153,7 @@ class Facts:
     describe: Callable[[], Mapping[str, float]] = dict
     look: Callable[[], Sight] | None = None
     each: Mapping[str, Facts] = field(default_factory=dict)
+    others: tuple[Facts, ...] = ()
     views: tuple[Facts, ...] = ()
     gives_copies: ClassVar[bool] = True
 

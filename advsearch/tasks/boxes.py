@@ -16,6 +16,9 @@ FORMS = ("xyxy", "xywh", "cxcywh", "yxyx")
 """How a box may be given: corners; a corner or the middle with width and height; corners with y first."""
 
 SMALLEST = 1e-6  # scores and overlaps below this, or as near to 1, count as this: log-odds of 13.8
+LEAST_OVERLAP = 0.1
+"""Least intersection over union of a box that is on the object at all (TIDE's threshold of the background)."""
+
 AMONG = 500  # among how many of the best scores boxes are looked for
 
 MOST = 2000
@@ -79,19 +82,22 @@ def left_over(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
 class Place:
     """What is to be found in a picture, the truth of detection: indices of the right classes, and the smallest box
     round what is seen of the object, x0, y0, x1, y1 in pixels, or None. Size: (height, width) of the picture in
-    pixels."""
+    pixels. And the boxes round what is seen of other things with one of these classes."""
 
     labels: Labels
     box: tuple[int, int, int, int] | None
     size: tuple[int, int]
+    others: tuple[tuple[int, int, int, int], ...] = ()
 
     @property
     def shares(self) -> Tensor | None:
         """The box as shares of width and height, (4,)."""
-        if self.box is None:
-            return None
+        return None if self.box is None else self.fractions_of(self.box)
+
+    def fractions_of(self, box: tuple[int, int, int, int]) -> Tensor:
+        """Return a box in pixels as fractions of width and height, (4,)."""
         height, width = self.size
-        return torch.tensor(self.box) / torch.tensor([width, height, width, height])
+        return torch.tensor(box) / torch.tensor([width, height, width, height])
 
 
 def overlap_with(one: Detections, truth: Place) -> Tensor:

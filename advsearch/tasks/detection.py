@@ -19,12 +19,13 @@ from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.models.labels import names_nothing
-from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW
+from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW, OUTCOME, Outcome
 from advsearch.tasks import detector_outputs as outputs
 from advsearch.tasks.base import Facts, Mark, Prediction, Said
 from advsearch.tasks.boxes import (
     FORMS,
     KNOWN,
+    LEAST_OVERLAP,
     SMALLEST,
     UNITS,
     Detections,
@@ -35,6 +36,7 @@ from advsearch.tasks.boxes import (
     listed,
     log_odds,
     numbers_of,
+    overlap,
     overlap_with,
     share_inside,
     strongest_boxes,
@@ -47,7 +49,7 @@ from advsearch.tasks.detector_outputs import ASK_ORDER, HEADS, LAYOUTS, QUERIES,
 GOALS = {
     "vanish": "no right box is found where the object is",
     "mislabel": "a box where the object is has a wrong name, and none the right one",
-    "displace": "boxes with the right name are found, and none of them where the object is",
+    "displace": "boxes with the right name are found, and none of them fits the object: they are loose or elsewhere",
     "create": "a box is found where nothing is",
 }
 """What an attack may be after, by the name of the objective."""
@@ -55,7 +57,27 @@ GOALS = {
 MOST, LEAST = 8, 0.1
 """Most boxes that are kept of a picture; the least score of one, and of one that is suppressed."""
 
-ELSEWHERE = "elsewhere"  # how a prediction says that a box is not where the object is
+ON_IT = 0.5  # fraction of a box from which on it is on the object, however little it overlaps
+
+LABELS = {Outcome.LOOSE: "{} in a loose box", Outcome.PHANTOM: "{} elsewhere", Outcome.MISSED: f"{NO}{{}}"}
+"""What a prediction is called by its outcome and class; by its class alone where it is not here."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What becomes of the object in the boxes of a picture.
+
+    Attributes:
+        outcome: None where nothing of the object is to be seen, and nothing is found either.
+        index: of the class that it is about: the one that is found, or the right one.
+        score: of the box that decides; None where that is no number.
+        iou: intersection over union of that box with the true one; None where there is no box, or no true one.
+    """
+
+    outcome: Outcome | None
+    index: int
+    score: float | None = None
+    iou: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,7 +254,16 @@ class Detection(ClassTask):
 
     def truth(self, facts: Facts) -> Place:
         height, width = facts.mask.shape
-        return Place(self.right_classes(facts), facts.box, (height, width))
+        right = self.right_classes(facts)
+        others = [other.box for other in facts.others if self._has_class(other, right)]
+        return Place(right, facts.box, (height, width), tuple(box for box in others if box is not None))
+
+    def _has_class(self, facts: Facts, classes: Labels) -> bool:
+        """Whether a thing's own label is one of some classes of the model."""
+        try:
+            return not set(classes).isdisjoint(self.right_classes(facts))
+        except InputError:  # it has no label, or none that the model knows
+            return False
 
     def truth_names(self, truth: Place) -> tuple[str, ...]:
         return self.names(truth.labels)
@@ -278,7 +309,7 @@ class Detection(ClassTask):
         return torch.minimum(away, sure)
 
     def _create(self, one: Detections, truth: Place) -> Tensor:
-        return log_odds(best_of(self._rivals(self._left(one), ()), self._elsewhere(one, truth))) - self._bar
+        return log_odds(best_of(self._as_phantoms(self._left(one), truth))) - self._bar
 
     def _at(self, one: Detections, truth: Place) -> Tensor:
         """Which boxes are where the object is, (D,) bool."""
@@ -330,7 +361,42 @@ class Detection(ClassTask):
         """Boxes of which most is not on the object, and that do not frame it, (D,) bool."""
         if truth.shares is None:
             return torch.ones(len(one["boxes"]), dtype=torch.bool, device=one["boxes"].device)
-        return (share_inside(one["boxes"], truth.shares.to(one["boxes"])) < 0.5) & ~self._at(one, truth)
+        return (share_inside(one["boxes"], truth.shares.to(one["boxes"])) < ON_IT) & ~self._at(one, truth)
+
+    @staticmethod
+    def _lie_on(boxes: Tensor, true: Tensor) -> Tensor:
+        """Find boxes (D, 4) that are on what has a true box (4,), however loosely, (D,) bool."""
+        return (overlap(boxes, true) >= LEAST_OVERLAP) | (share_inside(boxes, true) >= ON_IT)
+
+    def _loosely(self, one: Detections, truth: Place) -> Tensor:
+        """Boxes on the object that fit no other thing of its class better, (D,) bool."""
+        boxes, true = one["boxes"], truth.shares
+        assert true is not None
+        on_it = self._lie_on(boxes, true.to(boxes))
+        for other in truth.others:
+            on_it = on_it & (overlap_with(one, truth) >= overlap(boxes, truth.fractions_of(other).to(boxes)))
+        return on_it
+
+    def _away(self, one: Detections, truth: Place) -> Tensor:
+        """Boxes that are neither on the object nor on another thing of its class, (D,) bool."""
+        boxes = one["boxes"]
+        away = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
+        for true in [*([] if truth.box is None else [truth.box]), *truth.others]:
+            away = away & ~self._lie_on(boxes, truth.fractions_of(true).to(boxes))
+        return away
+
+    def _as_phantoms(self, one: Detections, truth: Place) -> Tensor:
+        """The score of each box as one where nothing is, (D,): of a class that is sought, or any. A loose box of the
+        object's own class is none."""
+        if self.target is not None:
+            sought = set(self.target)
+            own = self._of(one, tuple(sorted(sought & set(truth.labels))))
+            different = self._of(one, tuple(sorted(sought - set(truth.labels))))
+        else:
+            own = self._of(one, truth.labels)
+            different = self._rivals(one, truth.labels)
+        own = torch.where(self._away(one, truth), own, 0.0)
+        return torch.maximum(own, torch.where(self._elsewhere(one, truth), different, 0.0))
 
     @staticmethod
     def _of(one: Detections, labels: Labels) -> Tensor:
@@ -372,32 +438,55 @@ class Detection(ClassTask):
                 }
                 for box, label, score in listed(one, MOST, self._least, self.suppression)
             ]
-            payload: JsonValue = {"box": None if truth.box is None else list(truth.box), "found": boxes}
-            found.append((self._prediction(self._left(one), truth), payload))
+            finding = self._find(self._left(one), truth)
+            payload: dict[str, JsonValue] = {"box": None if truth.box is None else list(truth.box), "found": boxes}
+            if finding.outcome is not None:
+                iou = None if finding.iou is None else round(finding.iou, 3)
+                payload |= {OUTCOME: finding.outcome.value, "class": self.name_of(finding.index), "iou": iou}
+            found.append((self._prediction(finding, truth), payload))
         return found
 
-    def _prediction(self, one: Detections, truth: Place) -> Prediction:
-        """What a model says of the object, with the score of the box that says so."""
+    def _find(self, one: Detections, truth: Place) -> Finding:
+        """Decide what becomes of the object in boxes that suppression has left."""
+        right_score = self._of(one, truth.labels)
+        away = self._away(one, truth)
         if self.seek == "create" and float(self._create(one, truth)) > 0.0:
-            return self._named(one, self._rivals(one, ()), self._elsewhere(one, truth), f"{{}} {ELSEWHERE}")
+            phantom_score = self._as_phantoms(one, truth)
+            return self._decided(Outcome.PHANTOM, one, phantom_score, phantom_score > 0.0, truth)
         if truth.box is None:
-            return Prediction(OUT_OF_VIEW)
-        near, right, wrong = self._at(one, truth), self._of(one, truth.labels), self._rivals(one, truth.labels)
-        best = float(best_of(right, near))
-        if best >= self.confidence:
-            return self._named(one, right, near)
-        if float(best_of(wrong, near)) >= self.confidence:
-            return self._named(one, wrong, near)
-        if float(best_of(right)) >= self.confidence:
-            return self._named(one, right, ~near, f"{{}} {ELSEWHERE}")
-        return Prediction(f"{NO}{self.name_of(truth.labels[0])}", None, best if math.isfinite(best) else None)
+            if self.seek != "create" and float(best_of(right_score, away)) >= self.confidence:
+                return self._decided(Outcome.PHANTOM, one, right_score, away, truth)
+            return Finding(None, truth.labels[0])
+        at = self._at(one, truth)
+        candidates = (
+            (Outcome.FOUND, right_score, at),
+            (Outcome.WRONG_CLASS, self._rivals(one, truth.labels), at),
+            (Outcome.LOOSE, right_score, self._loosely(one, truth) & ~at),
+            (Outcome.PHANTOM, right_score, away),
+        )
+        for outcome, score, among in candidates:
+            if float(best_of(score, among)) >= self.confidence:
+                return self._decided(outcome, one, score, among, truth)
+        best = float(best_of(right_score, at))
+        return Finding(Outcome.MISSED, truth.labels[0], best if math.isfinite(best) else None)
 
-    def _named(self, one: Detections, scores: Tensor, among: Tensor, form: str = "{}") -> Prediction:
-        """The class of the best box among some."""
+    @staticmethod
+    def _decided(outcome: Outcome, one: Detections, scores: Tensor, among: Tensor, truth: Place) -> Finding:
+        """The outcome that the best box among some decides."""
         place = int(torch.where(among, scores, -1.0).argmax())
         score = float(scores[place])
-        label = int(one["labels"][place] if "labels" in one else (one["scores"][place] == score).nonzero()[0])
-        return Prediction(form.format(self.name_of(label)), label if form == "{}" else None, score)
+        index = int(one["labels"][place] if "labels" in one else (one["scores"][place] == score).nonzero()[0])
+        iou = None if truth.box is None else float(overlap_with(one, truth)[place])
+        return Finding(outcome, index, score, iou)
+
+    def _prediction(self, finding: Finding, truth: Place) -> Prediction:
+        """What a model says of the object, with the score of the box that says so."""
+        name = self.name_of(finding.index)
+        if finding.outcome is None or (truth.box is None and self.seek != "create"):
+            return Prediction(OUT_OF_VIEW)
+        if finding.outcome in LABELS:
+            return Prediction(LABELS[finding.outcome].format(name), None, finding.score)
+        return Prediction(name, finding.index, finding.score)
 
     def marks(self, output: Sequence[Detections], truth: Place) -> list[list[Mark]]:
         """See `Task.marks`: the true box, and every box with a score of `confidence`."""

@@ -11,11 +11,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.options import NOT_A_NUMBER, OUT_OF_VIEW
+from advsearch.options import NOT_A_NUMBER, OUT_OF_VIEW, OUTCOME, Outcome
 from advsearch.tasks.base import Facts, Mark, Prediction, Said
 from advsearch.tasks.classification import NO, ClassTask, Labels, members, target_lead, wrong_lead
 
 EXPECTED = "expected logits (N, classes, height, width), or a mapping with these under 'out' or 'logits'"
+
+LEAST_ACCURACY = 0.1  # fraction of the object's pixels from which on it is seen in part
 
 Lead = Callable[[Tensor, Labels], Tensor]
 
@@ -129,8 +131,9 @@ class Segmentation(ClassTask):
 
     def said(self, output: Tensor, truth: Region, margins: Sequence[float]) -> list[Said]:
         """See `Task.said`. The prediction is the class of most of the object's pixels; a wrong one where too few are
-        right, and "no bottle" where most of these are background. Its probability is the share of the object's pixels
-        that are right. Beside it stand shares of these by class, and the overlap."""
+        right, and where most of these are background "no bottle", or "bottle in part" from `LEAST_ACCURACY` on. Its
+        probability is the share of the object's pixels that are right. Beside it stand the outcome, shares of the
+        pixels by class, and the overlap."""
         found: list[Said] = []
         mask = truth.at((output.shape[2], output.shape[3])).to(output.device)
         for logits, margin in zip(output, margins, strict=True):
@@ -143,10 +146,15 @@ class Segmentation(ClassTask):
             first = int(counts.masked_fill(members(pixels, truth.labels) != right, -1).argmax())
             accuracy, overlap = float(hits[mask].float().mean()), float((hits & mask).sum() / (hits | mask).sum())
             said = Prediction(self.name_of(first), first, accuracy)
+            outcome = Outcome.FOUND if right else Outcome.WRONG_CLASS
             if not right and first in self.nothing:
-                said = Prediction(f"{NO}{self.name_of(truth.labels[0])}", None, accuracy)
+                name = self.name_of(truth.labels[0])
+                is_partly_right = accuracy >= LEAST_ACCURACY
+                outcome = Outcome.LOOSE if is_partly_right else Outcome.MISSED
+                said = Prediction(f"{name} in part" if is_partly_right else f"{NO}{name}", None, accuracy)
             shares = {self.name_of(i): round(n / len(pixels), 4) for i, n in enumerate(counts.tolist()) if n}
-            found.append((said, {"accuracy": round(accuracy, 4), "iou": round(overlap, 4), "pixels": shares}))
+            numbers = {"accuracy": round(accuracy, 4), "iou": round(overlap, 4)}
+            found.append((said, {OUTCOME: outcome.value, **numbers, "pixels": shares}))
         return found
 
     @staticmethod

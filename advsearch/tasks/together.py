@@ -18,7 +18,7 @@ from advsearch.files import JsonValue
 from advsearch.models import Model, Preprocessing
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.model import joined
-from advsearch.options import FROM_RUN, JOINED, OUT_OF_VIEW
+from advsearch.options import FROM_RUN, JOINED, OUT_OF_VIEW, OUTCOME, get_outcome
 from advsearch.tasks.base import Facts, Judgement, Mark, Output, Prediction, Said, Task, Truth, mean
 from advsearch.tasks.command import Command
 
@@ -99,6 +99,12 @@ class Joined(Task):
 
 def _distinct(texts: Iterable[Iterable[str]]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(chain.from_iterable(texts)))
+
+
+def outcome_in(judgement: Judgement) -> dict[str, JsonValue]:
+    """Return the outcome that a judgement states, as a part of a payload; empty where it states none."""
+    outcome = get_outcome(judgement.payload)
+    return {} if outcome is None else {OUTCOME: outcome.value}
 
 
 def all_said(predictions: Iterable[Prediction]) -> Prediction:
@@ -187,6 +193,8 @@ class Together(Joined):
         for each in zip(*(task.judge(*judged) for task, *judged in self._each(output, truth)), strict=True):
             payloads = {model.name: judged.payload for model, judged in zip(self.models, each, strict=True)}
             payload = payloads if any(kept is not None for kept in payloads.values()) else None
+            worst = min(each, key=lambda judged: judged.margin)
+            payload = None if payload is None else {**payload, **outcome_in(worst)}
             margin = math.nan if any(judged.not_a_number for judged in each) else min(judged.margin for judged in each)
             prediction = all_said(judged.prediction for judged in each)
             judgements.append(Judgement.of(min(judged.score for judged in each), margin, prediction, payload))
@@ -266,6 +274,7 @@ class EachThing(Joined):
             }
             things = {
                 name: {"right": thing.right, "margin": thing.margin, "answer": thing.prediction.label}
+                | outcome_in(thing)
                 | ({"box": payloads[name]["box"]} if "box" in payloads[name] else {})
                 for name, thing in by_name.items()
             }
@@ -404,7 +413,11 @@ class Rig(Joined):
                 for judged in each
             ]
             prediction = all_said(judged.prediction for judged in each)
-            judgements.append(Judgement.of(score, margin, prediction, {"pictures": kept}))
+            # the picture by which the rule decides; of the mean, the worst one
+            deciding = min(
+                each, key=lambda judged: judged.margin if self.rule == "mean" else abs(judged.margin - margin)
+            )
+            judgements.append(Judgement.of(score, margin, prediction, {"pictures": kept, **outcome_in(deciding)}))
         return judgements
 
     def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:

@@ -75,7 +75,7 @@ def read_columns(run: Path, after: int = 0, most: int | None = None) -> pd.DataF
         if not isinstance(payload, dict) or "box" not in payload:
             boxes.ends.append(len(boxes.numbers) // OF_A_BOX)
             return {}
-        sought = (row.label or "").removeprefix("no ")
+        sought = payload.get("class", row.label)
         try:
             best = next((one["box"] for one in payload.get("found", ()) if one["label"] == sought), None)
             boxes.put(payload)
@@ -102,12 +102,14 @@ def packed(rows: pd.DataFrame, *, more: bool = False, running: bool = False) -> 
     is none. `others` are all `Boxes`, up to each row's `others end`.
     """
     predictions, labels = _levels(rows["label"])
+    outcomes, outcome_names = _levels(rows["outcome"])
     share = 10_000 * rows["probability"].clip(0.0, 1.0).to_numpy()
     columns = {
         "step": rows["step"].to_numpy(np.uint32),
         "margin": rows["margin"].to_numpy(np.float32),
         "answer": predictions,
         "probability": np.where(np.isnan(share), NO_PROBABILITY, share.round()).astype(np.uint16),
+        "outcome": outcomes,
         "right": rows["correct"].where(rows["label"] != OUT_OF_VIEW).fillna(UNKNOWN).to_numpy(np.uint8),
         "unit": rows["unit"].to_numpy(np.uint32),
     }
@@ -137,6 +139,7 @@ def packed(rows: pd.DataFrame, *, more: bool = False, running: bool = False) -> 
         "more": more,
         "running": running,
         "answers": labels,
+        "outcomes": outcome_names,
         "parameters": parameters,
         "things": list(boxes.names) if boxes is not None else [],
         "columns": [

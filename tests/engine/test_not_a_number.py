@@ -15,6 +15,7 @@ import advsearch
 from advsearch.attacks import Trials
 from advsearch.engine.record import control_group, judgement_of, rate_of, trial_row
 from advsearch.errors import InputError
+from advsearch.options import Outcome
 from advsearch.questions.attack import wording
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.report.wording import calls, prediction_cells, tally
@@ -75,7 +76,7 @@ def test_a_clean_scene_without_a_number_is_said_as_such() -> None:
             calls(task, "this mug", "not a number") == "predicts nothing for this mug, for its output is not a number"
         )
         assert prediction_cells(task, Prediction("not a number")) == ["not a number", ""]
-    assert calls("segmentation", "this bottle", "no bottle") == "finds no bottle"
+    assert calls("segmentation", "this bottle", "no bottle", Outcome.MISSED) == "finds no bottle"
 
 
 class Broken(nn.Module):

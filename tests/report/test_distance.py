@@ -13,7 +13,7 @@ from stored_sweeps import make_sweep
 
 from advsearch.attacks.trials import clopper_pearson
 from advsearch.errors import InputError
-from advsearch.questions.sweep.display import distance_of, distance_sentence, seen_from
+from advsearch.questions.sweep.display import distance_of, distance_sentence, find_dips, seen_from
 from advsearch.questions.sweep.page import SweepSource, sweep_page_html
 from advsearch.questions.sweep.summary import AxisRow
 
@@ -41,6 +41,54 @@ def test_a_share_that_rises_with_the_distance_is_pooled() -> None:
     pooled = 28 / 40
     part = (pooled - 0.5) / (pooled - 0.1)
     assert found.distance == pytest.approx(20.0 * 2.0**part)
+
+
+def test_a_range_with_a_dip_has_no_one_distance() -> None:
+    found = seen_from(rows([7, 20, 20, 4, 0]))
+    (dip,) = [one for one in found.dips if one.is_shown]
+    assert (dip.distance, dip.seen, dip.until, dip.beyond) == (5.0, (7, 20), 20.0, (40, 40))
+    assert dip.p < 1e-6 and not found.is_monotone
+    assert found.distance == pytest.approx(20.0 * 2.0 ** (0.5 / 0.8)), "beyond the dip nothing is pooled with it"
+    said = distance_sentence(found)
+    assert said.startswith("No one distance from which on it is seen: right in 7 of 20 at 5 m, 40 of 40 beyond it")
+    assert "Beyond that the share falls below a half at 30.8 m; 20 to 80 m with 95 % confidence." in said
+
+
+def test_a_dip_that_chance_explains_is_told_beside_the_estimate() -> None:
+    found = seen_from(rows([3, 5, 6, 1, 0], 8))
+    assert found.is_monotone
+    said = distance_sentence(found)
+    assert said.startswith("Seen from 22.7 m in half of the pictures")
+    assert (
+        "Nearer it is right less often: in 3 of 8 at 5 m, 11 of 16 beyond it up to 20 m (p = 1), which may be" in said
+    )
+    everywhere = distance_sentence(seen_from(rows([3, 6, 6, 5, 5], 8)))
+    assert everywhere.startswith("Seen in at least half of the pictures up to the farthest distance, 80 m")
+    assert "in 3 of 8 at 5 m" in everywhere
+
+
+@pytest.mark.parametrize("shares", [(0.5,) * 8, (0.9,) * 8, (0.8,) * 4 + (0.3,) * 4, tuple(np.linspace(0.95, 0.05, 8))])
+@pytest.mark.parametrize("of", [8, 40])
+def test_a_falling_curve_has_a_shown_dip_in_one_of_twenty_at_most(shares: tuple[float, ...], of: int) -> None:
+    rng = np.random.default_rng(7)
+    tables, alarms = 300, 0
+    for _ in range(tables):
+        right = rng.binomial(of, shares)
+        alarms += any(dip.is_shown for dip in find_dips(range(1, 9), right, np.full(8, of)))
+    assert alarms <= 0.05 * tables
+
+
+def test_loose_boxes_are_no_misses() -> None:
+    loose = {5.0: 12, 20.0: 3}
+    listed = [
+        row.model_copy(update={"outcomes": {"loose": loose.get(float(row.value), 0), "missed": 2}})  # type: ignore[arg-type]
+        for row in rows([8, 20, 15, 5, 0])
+    ]
+    found = seen_from(listed)
+    assert found.loose == (12, 0, 3, 0, 0)
+    said = "Not counted as seen, but not missed either, are loose boxes: 12 of 20 at 5 m, 3 of 20 at 20 m."
+    assert distance_sentence(found).endswith(said)
+    assert "loose" not in distance_sentence(seen_from(rows([8, 20, 15, 5, 0])))
 
 
 @pytest.mark.parametrize(

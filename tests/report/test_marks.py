@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 import torch
 
+from advsearch.options import Outcome
 from advsearch.report.figures import SAID, SMALLEST, TINT, TRUE, marked
-from advsearch.report.wording import calling, calls, margin_text, marks_text, prediction_cells, prediction_text, wanted
+from advsearch.report.wording import (
+    calling,
+    calls,
+    get_only_outcome,
+    margin_text,
+    marks_text,
+    outcomes_text,
+    prediction_cells,
+    prediction_text,
+    wanted,
+)
 from advsearch.tasks import Mark, Prediction
 
 
@@ -89,7 +102,6 @@ def test_a_large_picture_keeps_its_size_and_nothing_changes_nothing() -> None:
         ("classification", Prediction("vase", 3, 0.913), "vase, 91 %"),
         ("classification", Prediction("vase", 3, 0.9999999), "vase, over 99.9 %"),
         ("detection", Prediction("cup", 46, 0.762), "cup (score 0.76)"),
-        ("detection", Prediction("no cup", None, 0.124), "no cup found (best score of cup 0.12)"),
         ("detection", Prediction("cup elsewhere", None, 0.7), "cup elsewhere (score 0.70)"),
         ("detection", Prediction("out of view"), "out of view"),
         ("segmentation", Prediction("background", 0, 0.031),
@@ -101,13 +113,60 @@ def test_an_answer_in_words(task: str, answer: Prediction, text: str) -> None:
     assert prediction_text(task, answer) == text
 
 
+def said(label: str, probability: float, **payload: object) -> SimpleNamespace:
+    """A prediction as a result has it: with what its task keeps beside it."""
+    return SimpleNamespace(label=label, index=None, probability=probability, payload=payload)
+
+
+def test_a_detector_s_prediction_in_words_follows_its_outcome() -> None:
+    missed = said("no cup", 0.124, outcome="missed", **{"class": "cup"})
+    assert prediction_text("detection", missed) == "no cup found (best score of cup 0.12)"
+    assert prediction_cells("detection", missed) == ["no cup found", "best score of cup 0.12"]
+    loose = said("cup in a loose box", 0.81, outcome="loose", iou=0.431)
+    assert prediction_text("detection", loose) == "cup in a loose box (score 0.81, overlap 0.43)"
+    none = said("no bottle", 0.02, outcome="missed")
+    assert prediction_text("segmentation", none) == "no bottle found, accuracy over the object's pixels 2 %"
+    partly = said("bottle in part", 0.31, outcome="loose")
+    assert prediction_text("segmentation", partly) == "bottle in part, accuracy over the object's pixels 31 %"
+
+
+@pytest.mark.parametrize("payload", [{"outcome": "loose", "iou": "x"}, {"outcome": ["loose"]}, {"outcome": "missed"}])
+def test_a_payload_of_a_stranger_is_no_error(payload: dict[str, object]) -> None:
+    assert prediction_text("detection", said("cup", 0.5, **payload)).startswith("cup")
+
+
+@pytest.mark.parametrize(
+    ("task", "label", "outcome", "does", "doing"),
+    [
+        ("detection", "no cup", "missed", "finds no cup", "finding no cup"),
+        ("detection", "bowl", "wrong class", "takes this mug for a bowl", "taking it for a bowl"),
+        ("detection", "cup in a loose box", "loose", "sees this mug, but in a loose box",
+         "seeing it, but in a loose box"),
+        ("detection", "dog elsewhere", "phantom", "sees a dog elsewhere, and none where this mug is",
+         "seeing a dog elsewhere, and none where it is"),
+        ("segmentation", "cup in part", "loose", "sees this mug, but only in part", "seeing it, but only in part"),
+    ],
+)  # fmt: skip
+def test_what_a_detector_does_follows_its_outcome(task: str, label: str, outcome: str, does: str, doing: str) -> None:
+    became = Outcome(outcome)
+    assert (calls(task, "this mug", label, became), calling(task, label, became)) == (does, doing)
+
+
+def test_outcomes_are_counted_in_words() -> None:
+    counts = {"loose": 4, "missed": 9, "phantom": 1, "wrong class": 2}
+    assert outcomes_text(counts, "detection") == "9 missed, 4 in a loose box, 2 of another class, 1 elsewhere"
+    assert outcomes_text(counts) == "9 missed, 4 loose, 2 of another class, 1 elsewhere"
+    assert outcomes_text({"loose": 4}, "segmentation") == "4 in part"
+    assert outcomes_text(None) == "" and outcomes_text({}) == ""
+    assert get_only_outcome({"loose": 4}) is Outcome.LOOSE
+    assert get_only_outcome(counts) is None and get_only_outcome(None) is None
+
+
 @pytest.mark.parametrize(
     ("task", "label", "does", "doing"),
     [
         ("classification", "iron", "calls this mug an iron", "calling it an iron"),
-        ("detection", "no cup", "finds no cup", "finding no cup"),
         ("detection", "bowl", "takes this mug for a bowl", "taking it for a bowl"),
-        ("detection", "dog elsewhere", "sees a dog where there is none", "seeing a dog where there is none"),
         ("segmentation", "sofa", "takes this mug for a sofa", "taking it for a sofa"),
         ("segmentation", "background", "takes this mug for background", "taking it for background"),
         ("yaw", "30 degrees", 'predicts "30 degrees" for this mug', 'predicting "30 degrees"'),
@@ -121,8 +180,4 @@ def test_margins_and_objectives_in_words() -> None:
     assert len({margin_text(task) for task in ("classification", "detection", "segmentation", "depth", "yaw")}) == 5
     assert len({marks_text(task) for task in ("detection", "segmentation", "yaw")}) == 3
     assert wanted("vanish", "this mug") == "makes the model miss this mug"
-    assert wanted("displace", "this mug") == "makes the model see this mug elsewhere"
-    assert prediction_cells("detection", Prediction("no cup", None, 0.124)) == [
-        "no cup found",
-        "best score of cup 0.12",
-    ]
+    assert wanted("displace", "this mug") == "makes the model see this mug elsewhere or in a loose box"

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from advsearch.attacks.objectives import check_objective, get_objective
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model
-from advsearch.options import NOT_A_NUMBER
+from advsearch.options import NOT_A_NUMBER, Outcome, get_outcome
 from advsearch.tasks import Detection, Facts, Judgement, Prediction, Sight
 from advsearch.tasks.boxes import Place, corners, left_over, log_odds, overlap, share_inside
 from advsearch.tasks.detection import GOALS
@@ -147,7 +147,7 @@ def test_a_right_box_that_suppression_drops_is_no_right_prediction() -> None:
     """A better cup beside the object takes the right box away; that is no success either, for the box was there."""
     output = dense((NEAR, [0.7, 0.0, 0.0]), (FAR, [0.9, 0.0, 0.0]))
     found = judged(TASK, output)
-    assert not found.right and not found.success and found.prediction.label == "cup elsewhere"
+    assert not found.right and not found.success and found.prediction.label == "cup in a loose box"
     assert judged(replace(TASK, suppression=1.0), output).right, "every box counts where none is suppressed"
     assert judged(TASK, sparse((NEAR, 0, 0.7), (FAR, 0, 0.9))).right, "boxes with labels have been through it"
     assert judged(TASK, dense((NEAR, [0.7, 0.0, 0.0]), (FAR, [0.0, 0.9, 0.0]))).right, "another class drops nothing"
@@ -205,6 +205,65 @@ def test_the_object_is_found_by_a_right_box_with_a_right_name(
     assert (found.prediction.label, found.prediction.index, found.right) == (answer.label, answer.index, right)
     assert found.prediction.probability == pytest.approx(answer.probability)
     assert found.success is not right
+
+
+LOOSE = [0.325, 0.25, 0.725, 0.65]  # overlaps the true box by .43
+SMALL = [0.3, 0.25, 0.4, 0.35]  # on the object, and overlaps it by .06
+WIDE = [0.5, 0.5, 0.9, 0.9]  # overlaps it by .03
+
+
+@pytest.mark.parametrize(
+    ("output", "outcome", "label", "iou"),
+    [
+        (dense((HERE, [0.8, 0.6, 0.0])), Outcome.FOUND, "cup", 1.0),
+        (dense((LOOSE, [0.8, 0.0, 0.0])), Outcome.LOOSE, "cup in a loose box", 0.43),
+        (sparse((LOOSE, 0, 0.8)), Outcome.LOOSE, "cup in a loose box", 0.43),
+        (dense((SMALL, [0.8, 0.0, 0.0])), Outcome.LOOSE, "cup in a loose box", 0.062),
+        (dense((LOOSE, [0.6, 0.0, 0.0]), (AWAY, [0.9, 0.0, 0.0])), Outcome.LOOSE, "cup in a loose box", 0.43),
+        (dense((HERE, [0.3, 0.6, 0.0])), Outcome.WRONG_CLASS, "bowl", 1.0),
+        (dense((HERE, [0.0, 0.6, 0.0]), (LOOSE, [0.8, 0.0, 0.0])), Outcome.WRONG_CLASS, "bowl", 1.0),
+        (dense((LOOSE, [0.3, 0.9, 0.0])), Outcome.MISSED, "no cup", None),
+        (dense((WIDE, [0.7, 0.0, 0.0])), Outcome.PHANTOM, "cup elsewhere", 0.032),
+        (dense((AWAY, [0.7, 0.9, 0.0])), Outcome.PHANTOM, "cup elsewhere", 0.0),
+        (dense((HERE, [0.49, 0.0, 0.0]), (AWAY, [0.0, 0.9, 0.9])), Outcome.MISSED, "no cup", None),
+        (sparse(), Outcome.MISSED, "no cup", None),
+    ],
+)
+def test_missed_loose_wrong_and_phantom_are_told_apart(
+    output: list[dict[str, Tensor]], outcome: Outcome, label: str, iou: float | None
+) -> None:
+    found = judged(TASK, output)
+    payload: Any = found.payload
+    assert (get_outcome(payload), found.prediction.label) == (outcome, label)
+    assert found.right is (outcome is Outcome.FOUND)
+    assert payload["iou"] == (None if iou is None else pytest.approx(iou, abs=0.001))
+    assert payload["class"] == ("bowl" if outcome is Outcome.WRONG_CLASS else "cup")
+
+
+def test_a_box_on_another_thing_of_the_class_is_no_phantom() -> None:
+    """Nor is one on it a loose box of the object: the object is missed."""
+    two = replace(TRUTH, others=((14, 14, 18, 18), (7, 5, 15, 13)))
+    assert get_outcome(judged(TASK, dense((AWAY, [0.9, 0.0, 0.0])), two).payload) is Outcome.MISSED
+    assert get_outcome(judged(TASK, dense((LOOSE, [0.9, 0.0, 0.0])), two).payload) is Outcome.MISSED
+    third = [0.0, 0.8, 0.2, 1.0]
+    assert get_outcome(judged(TASK, dense((third, [0.9, 0.0, 0.0])), two).payload) is Outcome.PHANTOM
+
+
+def test_what_is_found_where_the_object_is_not_visible_is_a_phantom() -> None:
+    """The picture counts for nothing, as any that does not show the object; what is kept says that it was found."""
+    hidden = replace(TRUTH, box=None)
+    found = judged(TASK, FOUND, hidden)
+    assert (found.right, found.prediction.label, get_outcome(found.payload)) == (True, "out of view", Outcome.PHANTOM)
+    nothing = judged(TASK, sparse(), hidden)
+    assert nothing.prediction.label == "out of view" and get_outcome(nothing.payload) is None
+
+
+def test_a_loose_box_of_the_object_creates_nothing() -> None:
+    task = TASK.seeking("create")
+    beside = [0.45, 0.2, 0.85, 0.6]  # of it less than half is on the object, which it overlaps by .23
+    assert not judged(task, dense((beside, [0.9, 0.0, 0.0]))).success
+    assert judged(task, dense((beside, [0.0, 0.0, 0.9]))).success, "a dog is no loose cup"
+    assert judged(task, dense((AWAY, [0.9, 0.0, 0.0]))).success
 
 
 def test_the_margin_is_in_log_odds_of_the_score_that_counts() -> None:

@@ -36,10 +36,10 @@ ALL, HALF, QUARTER = of([0, 1, 1, 0], [0, 1, 1, 0]), of([0, 1, 0, 0], [0, 2, 1, 
     [
         (ALL, 0.5, True, Prediction("bottle", 1, 1.0)),
         (HALF, 0.5, True, Prediction("bottle", 1, 0.5)),
-        (HALF, 0.51, False, Prediction("no bottle", None, 0.5)),
+        (HALF, 0.51, False, Prediction("bottle in part", None, 0.5)),
         (QUARTER, 0.5, False, Prediction("chair", 2, 0.25)),
         (QUARTER, 0.25, True, Prediction("bottle", 1, 0.25)),
-        (HALF, 1.0, False, Prediction("no bottle", None, 0.5)),
+        (HALF, 1.0, False, Prediction("bottle in part", None, 0.5)),
         (of([0, 0, 0, 0], [0, 0, 0, 0], sure=0.0), 1.0, True, Prediction("bottle", 1, 1.0)),
     ],
 )
@@ -48,6 +48,7 @@ def test_enough_of_the_objects_pixels_have_to_be_right(
 ) -> None:
     task = replace(TASK, accuracy=accuracy)
     (found,) = task.judge(output, TRUTH)
+    assert found.margin == 0.0 or found.prediction.label == answer.label
     assert found.right is right and (found.margin >= 0.0) is right and found.success is not right
     assert (found.prediction.index, found.prediction.probability) == (
         answer.index,
@@ -58,7 +59,8 @@ def test_enough_of_the_objects_pixels_have_to_be_right(
 
 def test_what_is_kept_has_accuracy_overlap_and_classes() -> None:
     payload: Any = TASK.judge(QUARTER, TRUTH)[0].payload
-    assert payload == {"accuracy": 0.25, "iou": 0.125, "pixels": {"background": 0.25, "bottle": 0.25, "chair": 0.5}}
+    pixels = {"background": 0.25, "bottle": 0.25, "chair": 0.5}
+    assert payload == {"outcome": "wrong class", "accuracy": 0.25, "iou": 0.125, "pixels": pixels}
 
 
 def test_every_picture_is_judged_by_itself() -> None:

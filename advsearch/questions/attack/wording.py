@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 
+from advsearch.options import get_outcome
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.report import wording as words
 from advsearch.report.wording import count, number_text
@@ -32,10 +33,11 @@ def attack_verdict(summary: AttackSummary) -> str:
     thing += " or a thing beside it" if summary.judge == "all" else ""
     after = f"after {count(summary.steps, 'step')}"
     if ending == "already wrong":
-        wrong = words.calls(summary.task, thing, summary.clean.label)
+        wrong = words.calls(summary.task, thing, summary.clean.label, get_outcome(summary.clean.payload))
         return f"The model already {wrong}: nothing was changed and nothing counts as found."
     if verified is None and ending == "interrupted" and summary.adversarial:
-        says = words.calls(summary.task, thing, summary.adversarial.label)
+        outcome = get_outcome(summary.adversarial.payload)
+        says = words.calls(summary.task, thing, summary.adversarial.label, outcome)
         return f"Interrupted {after}. What was found so far is not verified: the model {says}."
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} {after}; nothing is verified."
@@ -74,7 +76,9 @@ def remarks(summary: AttackSummary) -> list[str]:
     if control and missed and summary.ending != "already wrong" and not summary.minimises:
         apart = " They do not count." if summary.over else ""
         nothing = f"; in {control.not_a_number} the output is not a number" if control.not_a_number else ""
-        texts.append(f"The clean scene itself fails {missed} of its {control.trials} trials{nothing}.{apart}")
+        outcomes = words.outcomes_text(control.outcomes, summary.task)
+        how = f" ({outcomes})" if outcomes else ""
+        texts.append(f"The clean scene itself fails {missed} of its {control.trials} trials{how}{nothing}.{apart}")
     if summary.answer_from == "random" and beaten:
         tally = f"{beaten.successes} of {beaten.trials} with a margin of {beaten.margin:.2f}"
         texts.append(
@@ -189,12 +193,15 @@ def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str, cla
         claim += f" {where}" if where else ""
     if summary.minimises or summary.task == words.COMMAND:
         return claim[:1].upper() + claim[1:]
+    outcome = words.get_only_outcome(verified.outcomes)
     if len(labels) == 1:
-        return f"The model {words.calls(summary.task, thing, next(iter(labels)))}"
+        return f"The model {words.calls(summary.task, thing, next(iter(labels)), outcome)}"
     if labels:
         most = max(labels, key=lambda label: labels[label])
         what = "takes {} for one of the targets" if summary.target else "is wrong about {}"
-        return f"The model {what.format(thing)}, most often {words.calling(summary.task, most)},"
+        if outcome is None and verified.outcomes:
+            return f"The model {what.format(thing)} ({words.outcomes_text(verified.outcomes, summary.task)})"
+        return f"The model {what.format(thing)}, most often {words.calling(summary.task, most, outcome)},"
     if summary.task != words.CLASSIFICATION:
         return f"The model is wrong about {thing}"
     called = words.with_article(summary.adversarial.label) if summary.adversarial else "something else"

@@ -107,6 +107,7 @@ def compare(asked: Asked[CompareConfig]) -> CompareResult:
     from advsearch.questions.attack.studies import carry_out_part
     from advsearch.questions.compare.pairs import PairPictures, compared, differing, read_sides
     from advsearch.rules import interval_of
+    from advsearch.runs.tables import count_wrong_outcomes
 
     config, progress, renders = asked.config, asked.progress, 0
     if config.object:
@@ -146,6 +147,7 @@ def compare(asked: Asked[CompareConfig]) -> CompareResult:
                 correct=int(side.right.sum()),
                 accuracy=float(side.right.mean()),
                 interval=interval_of(side.rows),
+                outcomes=count_wrong_outcomes(side.rows),
                 seconds=float(side.rows["seconds"].mean()),
             )
             for side in sides

@@ -150,6 +150,8 @@ def shown(result: CompareResult) -> ShownResult:
         "95 % interval": lambda side: wording.interval_text(side.interval),
         "time a prediction": cost,
     }
+    if any(side.outcomes for side in result.sides):
+        columns = {**columns, "the others": lambda side: wording.outcomes_text(side.outcomes, result.task)}
     sections = [ResultPart.table(result.sides, columns, title="How often each is right")]
     for pair in result.pairs:
         sections += _of_pair(pair, several=len(result.pairs) > 1)
@@ -261,4 +263,6 @@ def claims(result: CompareResult) -> Iterator[Claim]:
         text = f"{headline(pair)} {alone_text(pair)} The interval of the difference is {how}."
         side = next(side for side in result.sides if side.name == pair.second)
         what = f"configurations in which {pair.second} is right"
+        others = wording.outcomes_text(side.outcomes, result.task)
+        text += f" Of the others {pair.second} has {others}." if others else ""
         yield claim("measured", text, counted(what, side.correct, side.configurations, side.interval))

@@ -37,6 +37,7 @@ from advsearch import rules
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.questions.explain.result import EnvelopeRow, ParameterWeight, RightOf, RuleNotTold
 from advsearch.rules import CountedRule, RuleCondition, RuleConditions, covered, interval_of
+from advsearch.runs.tables import count_wrong_outcomes
 
 MOST_PARTS = 20
 ROWS_IN_A_CELL = 25  # Rows that a cell of two factors' parts has on average, at least
@@ -206,7 +207,12 @@ def _peeled(conditions: RuleConditions, inside: pd.DataFrame) -> Iterator[RuleCo
 
 
 def right_of(rows: pd.DataFrame) -> RightOf:
-    return RightOf(right=int(rows["correct"].sum()), total=len(rows), interval=interval_of(rows))
+    return RightOf(
+        right=int(rows["correct"].sum()),
+        total=len(rows),
+        interval=interval_of(rows),
+        outcomes=count_wrong_outcomes(rows),
+    )
 
 
 def cautions(table: pd.DataFrame, importance: Sequence[ParameterWeight]) -> list[str]:

@@ -11,7 +11,17 @@ from advsearch.report import shown as showing
 from advsearch.report import wording
 from advsearch.report.shown import Claim, Column, Picture, ResultPart, ShownResult, claim, counted, share_text
 from advsearch.report.wording import conditions_text, interval_text, percent, share_of_text
-from advsearch.runs.results import ConditionRow, Fields, Interval, JsonFloat, RunResult
+from advsearch.runs.results import (
+    ONLY_OF_BOXES,
+    WHAT_BECOMES,
+    ConditionRow,
+    Fields,
+    Interval,
+    JsonFloat,
+    Outcomes,
+    RunResult,
+    optional,
+)
 
 
 class RightOf(Fields):
@@ -20,11 +30,15 @@ class RightOf(Fields):
     right: int = Field(description="right predictions")
     total: int = Field(alias="of", description="how many")
     interval: Interval = Field(description="of the share, 95 %")
+    outcomes: Outcomes = optional(f"{WHAT_BECOMES} in the other ones; {ONLY_OF_BOXES}")
 
     @property
     def text(self) -> str:
-        """A share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
-        return share_of_text(self.right, self.total, self.interval)
+        """A share with its interval and what it is of: ``12 % (9 to 16) of 340``; of a detector, what the others are:
+        ``... of 340 (250 missed, 49 loose)``."""
+        share = share_of_text(self.right, self.total, self.interval)
+        outcomes = wording.outcomes_text(self.outcomes)
+        return f"{share} ({outcomes})" if outcomes else share
 
 
 class Confirmation(RightOf):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import chain, product
@@ -154,6 +155,7 @@ class Hardening:
         self.rounds, self.stages = Rounds(run, course), Stages(course.work.progress)
         self.wrong = {(row.kind, row.step): bool(row.success) for row in run.store.rows()}
         self.clean: Mapping[str, list[bool]] = {}
+        self.outcomes: Mapping[str, dict[str, int]] = {}
         searched, held_out = self.config.scenes * self.config.rounds, scenes.CLEAN_SCENES * self.config.measured
         self.counts = {
             TRAINING: searched, FURTHER: course.further * searched, VALIDATION: self.rounds.judged, HELD_OUT: held_out
@@ -177,6 +179,10 @@ class Hardening:
             ]
             right = [both for _, both in self.scenes.each("looking at plain pictures of held-out scenes", looks)]
             self.clean = {when: [flag for both in right for flag in both[when]] for when in ("before", "after")}
+            self.outcomes = {
+                when: dict(Counter(outcome for both in right for outcome in both.get(f"outcomes {when}", ())))
+                for when in ("before", "after")
+            }
         finally:
             stages.end()
             gc.unfreeze()
@@ -234,8 +240,10 @@ class Hardening:
         ]
         return asked.result(
             HardenResult, **paired, environment=",".join(taught.environments), objects=list(taught.objects),
-            before=_share(before), after=_share(after), clean_before=_share(self.clean.get("before")),
-            clean_after=_share(self.clean.get("after")), table=table, split=split, rounds=rounds,
+            before=_share(before), after=_share(after),
+            clean_before=_share(self.clean.get("before"), self.outcomes.get("before")),
+            clean_after=_share(self.clean.get("after"), self.outcomes.get("after")),
+            table=table, split=split, rounds=rounds,
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search=f"portfolio of pgd with restarts, cmaes and random, {scenes.TIMES * config.steps} steps",
             # a name with a colon is of code that makes it
@@ -247,8 +255,9 @@ class Hardening:
         )  # fmt: skip
 
 
-def _share(right: Sequence[bool] | None) -> Share | None:
+def _share(right: Sequence[bool] | None, outcomes: Mapping[str, int] | None = None) -> Share | None:
     if right is None:
         return None
     total, count = sum(right), len(right)
-    return Share(accuracy=total / count, interval=clopper_pearson(total, count), right=total, count=count)
+    interval, counts = clopper_pearson(total, count), dict(outcomes or {}) or None
+    return Share(accuracy=total / count, interval=interval, right=total, count=count, outcomes=counts)

@@ -22,7 +22,16 @@ from advsearch.report.shown import (
     share_text,
 )
 from advsearch.report.wording import interval_text, percent
-from advsearch.runs.results import Fields, Interval, RunResult, SharedWork
+from advsearch.runs.results import (
+    ONLY_OF_BOXES,
+    WHAT_BECOMES,
+    Fields,
+    Interval,
+    Outcomes,
+    RunResult,
+    SharedWork,
+    optional,
+)
 from advsearch.settings import setting, setting_as_in
 
 ALL = "all"  # the objects of a command that takes all bundled ones
@@ -127,6 +136,7 @@ class Share(Fields):
     interval: Interval
     right: int
     count: int
+    outcomes: Outcomes = optional(f"of plain pictures, {WHAT_BECOMES} in the other ones; {ONLY_OF_BOXES}")
 
 
 class HardenedControl(Fields):
@@ -268,6 +278,9 @@ def shown(result: HardenResult) -> ShownResult:
             f"Of {after.count} held-out scenes the searches leave {after.right} right, before {before.right}; "
             f"of {left.count} plain pictures {left.right} are right, before {clean.right}."
         )
+        for when, share in (("Now", left), ("Before", clean)):
+            others = wording.outcomes_text(share.outcomes, result.task)
+            said += f" {when}, the other plain pictures are {others}." if others else ""
         if result.lost is not None:
             said += f" Scene by scene: {result.gained} got better, {result.lost} worse (p = {result.p:.2g})."
     chart: dict[str, Any] = {"draw": draw, "size": (6.4, 1.4 + 0.45 * len(shares))} if shares else {}

@@ -27,6 +27,7 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.reference import copied_network
 from advsearch.models.source import frozen
+from advsearch.options import get_outcome
 from advsearch.progress import NullProgress, Progress
 from advsearch.questions.attack.carry_out import attack_on, problem_of
 from advsearch.questions.attack.settings import AttackConfig
@@ -108,9 +109,10 @@ class SceneWork:
         config = self.attack((control,), name, seed=seed, **harder)
         return attacked(config, scene, self.model if weights is None else self.with_weights(weights))
 
-    def looked_at(self, *, number: int, weights: bytes) -> dict[str, list[bool]]:
-        """Return whether plain pictures of a held-out scene are right "before", with the given weights, and "after"."""
-        side, right = self.splits[HELD_OUT], {"before": list[bool](), "after": list[bool]()}
+    def looked_at(self, *, number: int, weights: bytes) -> dict[str, list[Any]]:
+        """Return whether plain pictures of a held-out scene are right "before", with the given weights, and "after";
+        and under "outcomes before" and "outcomes after" what becomes of the object in those that are not."""
+        side, right = self.splits[HELD_OUT], dict[str, list[Any]]()
         problem, _ = self.problem(side, number, tuple(self.config.controls)[:1])
         for view in range(CLEAN_VIEWS):
             seed = seeds.stream(side.seed, "plain", number * CLEAN_VIEWS + view)
@@ -118,7 +120,11 @@ class SceneWork:
             truth = problem.truth(problem.whole(problem.domain.start, seed))
             for when, model in (("before", self.model), ("after", self.with_weights(weights))):
                 with torch.no_grad():
-                    right[when].append(bool(problem.task.loss(model(picture), truth)[0] <= 0.0))
+                    judgement = problem.task.judge(model(picture), truth)[0]
+                right.setdefault(when, []).append(judgement.right)
+                outcome = get_outcome(judgement.payload)
+                if not judgement.right and outcome is not None:
+                    right.setdefault(f"outcomes {when}", []).append(outcome.value)
         return right
 
     def with_weights(self, weights: bytes) -> Model:

@@ -14,8 +14,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from advsearch.errors import InputError
+from advsearch.options import Outcome
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.sweep.summary import (
     AxisRow,
@@ -166,6 +168,9 @@ def shown(summary: SweepSummary) -> ShownResult:
         for pair in summary.beside.pairs:
             sides = (("clean", pair.clean), (summary.beside.answer, pair.answer))
             rows = [[name, f"right in {side.correct} of {side.configurations}", *_share(side)] for name, side in sides]
+            if any(side.outcomes for _, side in sides):
+                outcomes = [wording.outcomes_text(side.outcomes, summary.task) for _, side in sides]
+                rows = [[*row, text] for row, text in zip(rows, outcomes, strict=True)]
             sections.append(ResultPart(rows=rows))
     if far := distance_of(summary):
         sections.append(ResultPart(text=[distance_sentence(far)]))
@@ -179,7 +184,7 @@ def shown(summary: SweepSummary) -> ShownResult:
     if axes.keys() - {"answer"}:
         both = f"Of the clean scene and the adversarial one together: {READING[0].lower()}{READING[1:]}"
         sections.append(ResultPart(text=[both if summary.beside else READING]))
-        sections += [_table(name, rows) for name, rows in axes.items() if name != "answer"]
+        sections += [_table(name, rows, summary.task) for name, rows in axes.items() if name != "answer"]
     if summary.surface is not None:
         said = "\n".join(surface_sentences(summary.surface))
         sections.append(ResultPart("What is seen of the surface when the model is wrong:", [said]))
@@ -223,7 +228,10 @@ def _page_parts(summary: SweepSummary, axes: Mapping[str, Sequence[AxisRow]]) ->
             yield ResultPart.table(table.strongest, SURFACE_COLUMNS, title=title, folded=True)
     for name, rows in axes.items():
         if len(rows) <= MOST_LISTED:
-            yield ResultPart.table(rows, AXIS_COLUMNS, title=f"Accuracy by {name}", folded=True)
+            columns = dict(AXIS_COLUMNS)
+            if any(row.outcomes for row in rows):
+                columns["the others"] = lambda row: wording.outcomes_text(row.outcomes, summary.task)
+            yield ResultPart.table(rows, columns, title=f"Accuracy by {name}", folded=True)
 
 
 def _verdict(summary: SweepSummary) -> str:
@@ -235,10 +243,18 @@ def _verdict(summary: SweepSummary) -> str:
     rate = rate_text(summary)
     if summary.ending == INTERRUPTED and summary.looked_at < summary.planned:
         looked_at = f"{summary.looked_at} of {summary.planned} configurations"
-        return f"Interrupted after {looked_at}: right in {correct} ({rate})."
+        return f"Interrupted after {looked_at}: right in {correct} ({rate}){outcomes_clause(summary)}."
     if summary.beside and summary.beside.pairs:
         return " ".join(beside_text(summary.beside.answer, pair) for pair in summary.beside.pairs)
-    return f"The model is right in {correct} of {count(seen, 'configuration')} ({rate}){of_grid(summary)}."
+    outcomes = outcomes_clause(summary)
+    return f"The model is right in {correct} of {count(seen, 'configuration')} ({rate}){of_grid(summary)}{outcomes}."
+
+
+def outcomes_clause(summary: SweepSummary) -> str:
+    """Return what becomes of the object in the other configurations, as the end of a sentence; empty where only a
+    prediction is known."""
+    text = wording.outcomes_text(summary.outcomes, summary.task)
+    return f"; of the others, {text}" if text else ""
 
 
 def of_grid(summary: SweepSummary) -> str:
@@ -250,17 +266,19 @@ def _share(counts: CountedPredictions) -> tuple[str, str]:
     return percent(counts.accuracy), wording.interval_text(counts.interval)
 
 
-def _table(name: str, rows: Sequence[AxisRow]) -> ResultPart:
+def _table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
     listed, title = list(rows), name + (f", {rows[0].unit}" if rows[0].unit not in ("", "name", "1") else "")
     if len(rows) > MOST_ROWS:
         worst = sorted(range(len(rows)), key=lambda number: rows[number].accuracy or 0.0)[: MOST_ROWS // 2]
         listed = [rows[number] for number in sorted(worst)]
         title += f" (the {len(listed)} of {len(rows)} values where the model is right least often)"
+    has_outcomes = any(row.outcomes for row in rows)
     lines = []
     for row in listed:
         bar = ("#" * round((row.accuracy or 0.0) * BAR)).ljust(BAR, ".")
         share, interval = _share(row)
-        lines.append([wording.value_text(row.value), bar, share, f"{row.correct} of {row.configurations}", interval])
+        cells = [wording.value_text(row.value), bar, share, f"{row.correct} of {row.configurations}", interval]
+        lines.append([*cells, wording.outcomes_text(row.outcomes, task)] if has_outcomes else cells)
     return ResultPart(title, rows=lines)
 
 
@@ -303,7 +321,9 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
     }
     for who, counts in (models if len(split_names(result.model)) > 1 and models else {"The model": result}).items():
         extent = _extent("configurations in which the model is right", counts)
-        yield claim("measured", f"{who} is right in {share_text(extent)} {how}.{note}", extent)
+        outcomes = wording.outcomes_text(counts.outcomes, result.task)
+        others = f" Of the others: {outcomes}." if outcomes else ""
+        yield claim("measured", f"{who} is right in {share_text(extent)} {how}.{others}{note}", extent)
     if far := distance_of(result):
         yield claim("measured", distance_sentence(far), None)
     for drive in result.drives or ():
@@ -345,6 +365,7 @@ def drive_rows(one: DriveRates) -> list[tuple[str, str, str, str]]:
         ("longest gap", one.longest_gap, " s", ""),
         ("changes a second", one.flicker, "", ""),
         ("frames without its track", tracks.lost if tracks else None, " %", ""),
+        ("frames with a loose track instead", tracks.loose if tracks else None, " %", ""),
         ("identity switches", tracks.switches if tracks else None, "", ""),
         ("longest gap of its track", tracks.longest_gap if tracks else None, " s", ""),
     ]
@@ -383,14 +404,55 @@ def wrong_text(counted: CountedPredictions) -> str:
 
 DISTANCE = "camera.distance"  # the axis
 HALF = 0.5
+FALSE_ALARMS = 0.05
+"""Share of falling curves of which a dip is reported, at most."""
+
+
+@dataclass(frozen=True)
+class Dip:
+    """A distance at which an object is seen less often than beyond it.
+
+    Attributes:
+        distance: the nearer one.
+        seen: pictures that are right there, and how many there are.
+        until: the farthest of the distances beyond it that are compared with it.
+        beyond: pictures that are right at these, and how many there are.
+        p: how likely so large a difference is where the share falls with the distance; of all differences that were
+            looked at together.
+    """
+
+    distance: float
+    seen: tuple[int, int]
+    until: float
+    beyond: tuple[int, int]
+    p: float
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether chance is no explanation."""
+        return self.p <= FALSE_ALARMS
 
 
 @dataclass(frozen=True)
 class SeenFrom:
-    """The distance at which an object is first seen by somebody who comes nearer, in "metres" or "object sizes": the
-    `distances` (m,) at which there are pictures, the nearest first, the shares (m,) in which it is seen, and their 95 %
-    intervals; the estimate, None where it is seen at all distances, or at none; its interval, None where pictures do
-    not bound it on that side; and how many pictures at a distance any bound takes, where none has so many."""
+    """The distance at which an object is first seen by somebody who comes nearer.
+
+    Attributes:
+        unit: "metres" or "object sizes".
+        distances: (m,) at which there are pictures, the nearest first.
+        shares: (m,) of the pictures that are right.
+        intervals: (m,) theirs, 95 %.
+        distance: the estimate; None where it is seen at all distances, or at none. Of a share that does not fall with
+            the distance the last one: beyond the dips that are shown.
+        low: lower end of its interval; None where pictures do not bound it.
+        high: upper end, likewise.
+        lacking: how many pictures at a distance any bound takes, where none has so many.
+        loose: (m,) pictures in which a loose box is on it, which are not right, and no misses either; empty where
+            nothing is known of them.
+        counts: (m,) pictures.
+        dips: distances at which it is seen less often than beyond them, the nearest first.
+        everywhere: whether the falling line nowhere crosses one half, for it is seen in that much at all distances.
+    """
 
     unit: str
     distances: tuple[float, ...]
@@ -400,6 +462,15 @@ class SeenFrom:
     low: float | None
     high: float | None
     lacking: int | None
+    loose: tuple[int, ...] = ()
+    counts: tuple[int, ...] = ()
+    dips: tuple[Dip, ...] = ()
+    everywhere: bool = False
+
+    @property
+    def is_monotone(self) -> bool:
+        """Whether no dip is shown."""
+        return not any(dip.is_shown for dip in self.dips)
 
 
 def distance_of(summary: SweepSummary) -> SeenFrom | None:
@@ -414,8 +485,7 @@ def distance_of(summary: SweepSummary) -> SeenFrom | None:
 def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
     """Return the distance at which an object is first seen, from the rows of one axis: a distance, or both ends of a
     range of it, and the counts there. Raises InputError where there are fewer than two distances."""
-    from scipy.optimize import isotonic_regression  # takes a quarter of a second
-    from scipy.special import bdtr, bdtrc
+    from scipy.special import bdtr, bdtrc  # takes a tenth of a second
 
     if len(rows) < 2:
         raise InputError(f"detection distance: expected at least two distances, got {len(rows)}; sweep over more")
@@ -425,24 +495,75 @@ def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
     chance = 0.025 / len(rows)
     low = max(at[bdtrc(k - 1.0, n, HALF) < chance], default=None)
     high = min(at[(bdtr(k * 1.0, n, HALF) < chance) & (at > (low or 0.0))], default=None)
-    falling = isotonic_regression(k / n, weights=n, increasing=False).x
-    distance = np.exp(np.interp(-HALF, -falling, np.log(at))) if falling[0] >= HALF > falling[-1] else None
+    dips = find_dips(distances, k, n)
+    first = max((distances.index(dip.distance) + 1 for dip in dips if dip.is_shown), default=0)
     least = math.floor(-math.log2(chance)) + 1
-    low, high, distance = (None if end is None else float(end) for end in (low, high, distance))
+    outcomes = [getattr(row, "outcomes", None) or {} for row in rows]
+    falling = _fit_falling(k[first:], n[first:])
+    crosses = bool(falling[0] >= HALF > falling[-1])
     return SeenFrom(
         unit=rows[0].unit,
         distances=distances,
         shares=tuple((k / n).tolist()),
         intervals=tuple(row.interval or (0.0, 1.0) for row in rows),
-        distance=distance,
-        low=low,
-        high=high,
+        distance=float(np.exp(np.interp(-HALF, -falling, np.log(at[first:])))) if crosses else None,
+        low=None if low is None else float(low),
+        high=None if high is None else float(high),
         lacking=None if (n >= least).any() else least,
+        loose=tuple(one.get(Outcome.LOOSE.value, 0) for one in outcomes) if any(outcomes) else (),
+        counts=tuple(n.tolist()),
+        dips=dips,
+        everywhere=bool(falling[-1] >= HALF),
     )
 
 
+def _fit_falling(right: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Fit shares (m,) that do not rise, by isotonic regression."""
+    from scipy.optimize import isotonic_regression  # takes a quarter of a second
+
+    fitted: NDArray[np.float64] = isotonic_regression(right / counts, weights=counts, increasing=False).x
+    return fitted
+
+
+def find_dips(distances: Sequence[float], right: NDArray[np.int64], counts: NDArray[np.int64]) -> tuple[Dip, ...]:
+    """Find distances, the nearest first, at which an object is seen less often than beyond them.
+
+    Each distance is compared with each run of distances right behind it by Fisher's exact test (one-sided), and the
+    p-values are multiplied by how many comparisons there are (Bonferroni). Where the shares fall, those beyond are
+    at most the nearer one, which makes large differences only rarer: so one falling curve in twenty has a dip that is
+    shown, at most (`benchmarks/first_seen.py --simulated`). Listed are those that are shown, and those that bring the
+    estimate's line below the shares beyond, which may be chance.
+    """
+    from scipy.stats import hypergeom  # takes half a second
+
+    n_distances = len(distances)
+    comparisons = n_distances * (n_distances - 1) / 2.0
+    right_before, counts_before = (np.concatenate([[0], np.cumsum(column)]) for column in (right, counts))
+    dips = []
+    for near in range(n_distances - 1):
+        far = np.arange(near + 2, n_distances + 1)
+        right_beyond = right_before[far] - right_before[near + 1]
+        counts_beyond = counts_before[far] - counts_before[near + 1]
+        total_right, total = right_beyond + right[near], counts_beyond + counts[near]
+        p = hypergeom.cdf(right[near], total, total_right, counts[near])
+        lower = right[near] / counts[near] < right_beyond / counts_beyond
+        if not lower.any():
+            continue
+        best = int(np.argmin(np.where(lower, p, np.inf)))
+        dips.append(
+            Dip(
+                distance=float(distances[near]),
+                seen=(int(right[near]), int(counts[near])),
+                until=float(distances[near + 1 + best]),
+                beyond=(int(right_beyond[best]), int(counts_beyond[best])),
+                p=min(1.0, float(p[best]) * comparisons),
+            )
+        )
+    return tuple(dips)
+
+
 def distance_sentence(found: SeenFrom) -> str:
-    """Say it: "Seen from 38 m, 31 to 44 m ..."."""
+    """Say it: "Seen from 38 m, 31 to 44 m ...", then what contradicts it, and the loose boxes."""
     unit = "m" if found.unit == "metres" else found.unit
     low, high, distance = (
         None if number is None else f"{number:.3g}" for number in (found.low, found.high, found.distance)
@@ -454,12 +575,52 @@ def distance_sentence(found: SeenFrom) -> str:
         ends = f"at least {low} {unit}" if low else f"at most {high} {unit}"
     what = f"{ends} with 95 % confidence"
     what += "" if found.lacking is None else f" (that takes at least {found.lacking} pictures at each distance)"
+    dips = _dips_sentences(found, unit)
+    loose = _loose_sentence(found, unit)
+    if not found.is_monotone:
+        beyond = "Beyond that it is right in less than half of the pictures"
+        if distance is not None:
+            beyond = f"Beyond that the share falls below a half at {distance} {unit}"
+        elif found.everywhere:
+            beyond = f"Beyond that it is right in at least half of the pictures, up to {found.distances[-1]:.3g} {unit}"
+        return " ".join(filter(None, [*dips, f"{beyond}; {what}.", loose]))
     if distance is not None:
-        return f"Seen from {distance} {unit} in half of the pictures, {what}."
-    if found.shares[0] >= HALF:
+        said = f"Seen from {distance} {unit} in half of the pictures, {what}."
+    elif found.everywhere:
         farthest = f"{found.distances[-1]:.3g} {unit}"
-        return f"Seen in at least half of the pictures up to the farthest distance, {farthest}; {what}."
-    return f"Not seen in half of the pictures, even from {found.distances[0]:.3g} {unit}; {what}."
+        said = f"Seen in at least half of the pictures up to the farthest distance, {farthest}; {what}."
+    else:
+        said = f"Not seen in half of the pictures, even from {found.distances[0]:.3g} {unit}; {what}."
+    return " ".join(filter(None, [said, *dips, loose]))
+
+
+def _dips_sentences(found: SeenFrom, unit: str) -> list[str]:
+    """Say where it is seen less often than beyond: what is shown, or else the deepest of what may be chance."""
+
+    def text(dip: Dip) -> str:
+        here = f"{dip.seen[0]} of {dip.seen[1]} at {dip.distance:.3g} {unit}"
+        beyond = f"{dip.beyond[0]} of {dip.beyond[1]} beyond it up to {dip.until:.3g} {unit}"
+        return f"{here}, {beyond} (p = {dip.p:.2g})"
+
+    shown = [dip for dip in found.dips if dip.is_shown]
+    if shown:
+        return [f"No one distance from which on it is seen: right in {'; '.join(map(text, shown))}."]
+    until = found.distances[-1] if found.everywhere else found.distance or 0.0
+    below_half = [dip for dip in found.dips if dip.seen[0] < HALF * dip.seen[1] and dip.distance < until]
+    if not below_half:
+        return []
+    deepest = min(below_half, key=lambda dip: dip.p)
+    return [f"Nearer it is right less often: in {text(deepest)}, which may be chance."]
+
+
+def _loose_sentence(found: SeenFrom, unit: str) -> str:
+    """Say in how many pictures a loose box is on it, and at which distances; empty where nothing is known of it."""
+    total = sum(found.loose)
+    if not total:
+        return ""
+    each = zip(found.distances, found.loose, found.counts, strict=True)
+    listed = [f"{loose} of {count} at {at:.3g} {unit}" for at, loose, count in each if loose]
+    return f"Not counted as seen, but not missed either, are loose boxes: {', '.join(listed)}."
 
 
 def distance_axes(found: SeenFrom, axes: Any) -> None:
@@ -467,6 +628,11 @@ def distance_axes(found: SeenFrom, axes: Any) -> None:
     low, high = zip(*found.intervals, strict=True)
     axes.fill_between(found.distances, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval")
     axes.plot(found.distances, found.shares, color=BLUE, marker="o", label="seen in")
+    if any(found.loose):
+        or_loosely = [
+            share + loose / count for share, loose, count in zip(found.shares, found.loose, found.counts, strict=True)
+        ]
+        axes.plot(found.distances, or_loosely, color=GREY, marker=".", linestyle=":", label="or in a loose box")
     axes.axhline(HALF, color=GREY, linewidth=1, linestyle=(0.0, (5.0, 4.0)))
     if found.distance is not None:
         axes.axvline(found.distance, color=GREY, linewidth=1)

@@ -24,6 +24,7 @@ from advsearch.report.figures import marked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.tasks import Detection
+from advsearch.tasks.boxes import LEAST_OVERLAP
 
 ANIMATED = 60
 MOST_LISTED = 1000  # drives of a model whose own numbers are kept
@@ -152,12 +153,16 @@ class Drives:
         task, frames, tracker = self._job.tasks[model], len(self.times), self._job.tracker
         if not isinstance(task, Detection) or not all(number in self._frames for number in numbers.flat):
             return None
-        drives = [tracked([self._frames[k] for k in row], tracker, task.iou) for row in numbers.tolist()]
+        seen = [[self._frames[number] for number in row] for row in numbers.tolist()]
+        drives = [tracked(frames_of_drive, tracker, task.iou) for frames_of_drive in seen]
+        least = min(LEAST_OVERLAP, task.iou)
+        loosely = [tracked(frames_of_drive, tracker, least).lost for frames_of_drive in seen]
         step = self.seconds / (frames - 1)
         lost, switches, gaps = (np.array(values, dtype=float) for values in zip(*drives, strict=True))
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
             lost=over_drives(lost, max),
+            loose=over_drives(lost - np.array(loosely), max),
             switches=over_drives(switches, max, (0.0, frames - 1.0)),
             longest_gap=over_drives(gaps * step, max, (0.0, frames * step)),
         )

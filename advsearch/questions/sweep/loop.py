@@ -274,6 +274,7 @@ class Sweep:
         models, adversarial = [model.name for model in job.models], job.places[-1].beside_clean
         numbers = np.flatnonzero(predictions.counted)
         right, units, axes = predictions.right[numbers], self.units.of(numbers), self._axes(numbers)
+        outcome = predictions.outcome[numbers]
         changes = self._changes()
         renders = {"sweep": self._traced, "verification": checked.renders if checked else 0}
         pairs = predictions.beside(models, self.units) if adversarial else []
@@ -289,12 +290,13 @@ class Sweep:
             gains=gains if len(gains) > 1 else None,
             drawn={one.name: one.varied for one in self._shown},
             planned=self.total,
-            **vars(counted_by_unit(right, units)),
+            **vars(counted_by_unit(right, units, outcome)),
             out_of_view=int(predictions.hidden.sum()),
+            phantoms_out_of_view=predictions.phantoms_out_of_view,
             units=len(np.unique(units)) if self.units.size > 1 and len(units) else None,
             not_finite=predictions.not_finite,
             answers=predictions.frequent,
-            axes=[row for axis in axes for row in axis.rows(right, units)],
+            axes=[row for axis in axes for row in axis.rows(right, units, outcome)],
             cells=map_over(axes, right, predictions.margin[numbers]),
             beside=results.BesideClean(answer=adversarial, pairs=pairs) if adversarial else None,
             worst=worst,
@@ -347,7 +349,9 @@ class Sweep:
             )
         if hidden := int(predictions.hidden.sum()):
             seen = count(int(predictions.seen.sum()), "picture")
-            yield f"In {hidden} of {seen} nothing of the object is to be seen: they are not counted."
+            phantoms = predictions.phantoms_out_of_view
+            more = f" In {phantoms} of them the model finds the object all the same." if phantoms else ""
+            yield f"In {hidden} of {seen} nothing of the object is to be seen: they are not counted.{more}"
         if predictions.not_finite:
             yield f"{predictions.not_finite} predictions of the model are not numbers; they count as not right."
         if self._not_finite:

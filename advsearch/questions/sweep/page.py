@@ -156,7 +156,8 @@ def sweep_verdict(summary: SweepSummary) -> str:
         return " ".join(beside_text(summary.beside.answer, one) for one in summary.beside.pairs)
     ended = "" if summary.looked_at == summary.planned else f" so far, of {summary.planned} planned"
     share = f"({sweeps.rate_text(summary)}){sweeps.of_grid(summary)}"
-    return f"Right in {summary.correct} of {summary.configurations} configurations{ended} {share}."
+    outcomes = sweeps.outcomes_clause(summary)
+    return f"Right in {summary.correct} of {summary.configurations} configurations{ended} {share}{outcomes}."
 
 
 def _still(path: Path, summary: SweepSummary) -> Html:

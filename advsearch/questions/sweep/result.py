@@ -18,7 +18,7 @@ import pandas as pd
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.trials import paired_by_unit, per_unit, share_interval
 from advsearch.errors import FileFormatError
-from advsearch.options import OUT_OF_VIEW
+from advsearch.options import OUT_OF_VIEW, Outcome, get_outcome
 from advsearch.pictures import LARGEST_FILE, check_pixels, opened
 from advsearch.questions.sweep.display import sweep_axes, sweep_figure
 from advsearch.questions.sweep.job import KIND
@@ -38,11 +38,23 @@ MOST_CELLS = 4096  # cells of a map; with more pairs of values there is none
 MOST_PREDICTIONS = 20  # wrong predictions that the summary lists, the most frequent first
 
 
-def counted_by_unit(right: npt.ArrayLike, units: npt.NDArray[np.int64]) -> CountedPredictions:
-    """Return count, accuracy and its 95 % interval of predictions (n,) that are of some units (n,)."""
+OUTCOMES = tuple(Outcome)
+UNKNOWN_OUTCOME = 255  # in arrays of places among `OUTCOMES`
+
+
+def counted_by_unit(
+    right: npt.ArrayLike, units: npt.NDArray[np.int64], outcome: npt.NDArray[np.uint8] | None = None
+) -> CountedPredictions:
+    """Return count, accuracy and its 95 % interval of predictions (n,) that are of some units (n,), and the outcomes
+    (n,) of those that are not right, where they have some."""
     right = np.asarray(right)
     of = per_unit(np.ones(len(right)), units)
-    return rate(int(right.sum()), len(right), share_interval(per_unit(right, units), of) if len(right) else None)
+    counted = rate(int(right.sum()), len(right), share_interval(per_unit(right, units), of) if len(right) else None)
+    if outcome is None:
+        return counted
+    counts = np.bincount(outcome[right == 0], minlength=len(OUTCOMES))
+    named = {one.value: int(number) for one, number in zip(OUTCOMES, counts, strict=False) if number}
+    return counted.model_copy(update={"outcomes": named or None})
 
 
 def rate(correct: int, seen: int, interval: tuple[float, float] | None = None) -> CountedPredictions:
@@ -54,25 +66,34 @@ def rate(correct: int, seen: int, interval: tuple[float, float] | None = None) -
 
 class Predictions:
     """What is predicted so far, by the number of the configuration (n,): whether there is a prediction, whether it is
-    right and whether it is wrong, its margin, NaN where that is no number, and what it is. `hidden` are those with
-    nothing of what is judged in the picture."""
+    right and whether it is wrong, its margin, NaN where that is no number, and what it is; of a detector its outcome,
+    as a place among `OUTCOMES`. `hidden` are those with nothing of what is judged in the picture."""
 
     def __init__(self, total: int) -> None:
         self.seen: npt.NDArray[np.bool_] = np.zeros(total, dtype=bool)
         self.right, self._wrong, self.hidden = self.seen.copy(), self.seen.copy(), self.seen.copy()
         self.margin = np.full(total, np.nan)
+        self.outcome = np.full(total, UNKNOWN_OUTCOME, np.uint8)
         self._labels, self._names = np.zeros(total, np.uint32), dict[str, int]()
 
     def add(self, number: int, said: Judgement) -> None:
         self.seen[number], self.right[number], self._wrong[number] = True, said.right, said.success
         self.margin[number] = said.margin
         self.hidden[number] = said.prediction.label == OUT_OF_VIEW
+        outcome = get_outcome(said.payload)
+        if outcome is not None:
+            self.outcome[number] = OUTCOMES.index(outcome)
         self._labels[number] = self._names.setdefault(said.prediction.label, len(self._names))
 
     @property
     def counted(self) -> npt.NDArray[np.bool_]:
         """(n,) which there is a prediction of and something to see in."""
         return np.asarray(self.seen & ~self.hidden)
+
+    @property
+    def phantoms_out_of_view(self) -> int:
+        """In how many pictures without the object a detector finds it all the same."""
+        return int((self.hidden & (self.outcome == OUTCOMES.index(Outcome.PHANTOM))).sum())
 
     @property
     def worst(self) -> int | None:
@@ -102,13 +123,14 @@ class Predictions:
             if not len(known):
                 continue
             before, after = self.right.reshape(halves)[:, known, model]
+            outcome_before, outcome_after = self.outcome.reshape(halves)[:, known, model]
             draws = units.draw(known)
             difference, interval, _ = paired_by_unit(before, after, draws)
             pairs.append(
                 PairedRates(
                     model=name,
-                    clean=counted_by_unit(before, draws),
-                    answer=counted_by_unit(after, draws),
+                    clean=counted_by_unit(before, draws, outcome_before),
+                    answer=counted_by_unit(after, draws, outcome_after),
                     both=int((before & after).sum()),
                     clean_only=int((before & ~after).sum()),
                     answer_only=int((~before & after).sum()),
@@ -131,11 +153,20 @@ class SweptAxis:
     places: npt.NDArray[np.integer[Any]]
     kind: Literal["outside", "grid", "drawn"] = "outside"
 
-    def rows(self, right: npt.NDArray[np.bool_], units: npt.NDArray[np.int64]) -> list[AxisRow]:
-        """Return the table: right predictions (n,), which are of units (n,), by value; values without any are left
-        out."""
-        by_place = pd.DataFrame({"right": right, "unit": units}).groupby(self.places)
-        counts = ((self.values[place], counted_by_unit(rows.right, rows.unit)) for place, rows in by_place)
+    def rows(
+        self,
+        right: npt.NDArray[np.bool_],
+        units: npt.NDArray[np.int64],
+        outcome: npt.NDArray[np.uint8] | None = None,
+    ) -> list[AxisRow]:
+        """Return the table: right predictions (n,), which are of units (n,) and have an outcome (n,), by value; values
+        without any are left out."""
+        outcome = np.full(len(right), UNKNOWN_OUTCOME, np.uint8) if outcome is None else outcome
+        by_place = pd.DataFrame({"right": right, "unit": units, "outcome": outcome}).groupby(self.places)
+        counts = (
+            (self.values[place], counted_by_unit(rows.right, rows.unit, rows.outcome.to_numpy()))
+            for place, rows in by_place
+        )
         return [AxisRow(axis=self.name, unit=self.unit, value=value, **vars(count)) for value, count in counts]
 
 

@@ -29,6 +29,7 @@ class CountedPredictions(Fields):
     correct: int = Field(description="right predictions")
     accuracy: float | None = Field(description="their share; null where there is no configuration")
     interval: Interval | None = Field(description="of that share")
+    outcomes: results.Outcomes = results.optional(f"{results.WHAT_BECOMES} in the other ones; {results.ONLY_OF_BOXES}")
 
 
 class AxisRow(CountedPredictions):
@@ -173,6 +174,9 @@ class TrackRates(Fields):
 
     tracker: str = Field(description="its name")
     lost: OverDrives = Field(description="share of the frames that see the object in which no track is on it")
+    loose: OverDrives | None = results.optional(
+        "likewise, in which none fits it, but a loose one is on it; absent of older runs"
+    )
     switches: OverDrives = Field(description="how often the track on it has another number than before")
     longest_gap: OverDrives = Field(description="seconds of the longest run of frames without its track")
 
@@ -221,6 +225,9 @@ class SweepSummary(CountedPredictions, RunResult):
     out_of_view: int = Field(
         default=0,
         description="configurations with nothing of the object in the picture; `configurations` is without them",
+    )
+    phantoms_out_of_view: int = Field(
+        default=0, description="of these, in how many a detector finds the object all the same; absent without"
     )
     not_finite: int = Field(description="outputs that were not numbers; they count as not right")
     answers: dict[str, int] = Field(description="how often each wrong prediction was given, the 20 most frequent")

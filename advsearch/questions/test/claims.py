@@ -24,8 +24,8 @@ from advsearch.engine.journal import Journal, Shared, worker_call
 from advsearch.engine.problem import AWAY, Problem, as_claimed, changed
 from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
-from advsearch.files import JsonObject
-from advsearch.options import OUT_OF_VIEW
+from advsearch.files import JsonObject, JsonValue
+from advsearch.options import OUT_OF_VIEW, count_outcomes
 from advsearch.progress import Progress
 from advsearch.questions.attack.carry_out import executor_for, parts_of, problem_on
 from advsearch.questions.attack.settings import AttackConfig
@@ -34,7 +34,7 @@ from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, scene_digest
 from advsearch.questions.test.result import FAILED, HELD, TIME_OVER, UNDECIDED, ClaimResult
 from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim, ShareClaim
-from advsearch.report.wording import number_text
+from advsearch.report.wording import number_text, outcomes_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.settings import split_names
 
@@ -104,6 +104,7 @@ class Trial:
         sequence, least = ConfidenceSequence(self.suite.confidence, sides=1), least_mean(claim)
         values, hidden, verdict = list[float](), 0, UNDECIDED
         worst: tuple[float, Query, str] | None = None
+        wrong_payloads: list[JsonValue] = []
         self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
         with executor_for(shared, worker, self.progress) as executor:
             journal = Journal(self.run, Shared(problem, executor, "0" if several else ""))
@@ -115,6 +116,8 @@ class Trial:
                 if value is None:
                     hidden += 1
                     continue
+                if not own.said.right:
+                    wrong_payloads.append(own.said.payload)
                 sequence.add(value)
                 values.append(value)
                 if value == 0.0 and (worst is None or badness > worst[0]):
@@ -131,7 +134,10 @@ class Trial:
             reason = words.difference_reason(verdict, counts, interval, claim.than)
         else:
             what = "right" if isinstance(claim, RightClaim) else "as claimed"
-            reason = words.share_reason(what, verdict, values.count(1.0), len(values), interval, example)
+            outcomes = ""
+            if isinstance(claim, RightClaim):
+                outcomes = outcomes_text(count_outcomes(wrong_payloads), problem.task.name)
+            reason = words.share_reason(what, verdict, values.count(1.0), len(values), interval, example, outcomes)
         reason += f"; the object is not to be seen in {hidden} more, which are not counted" if hidden else ""
         reason += f"; {TIME_OVER}" if verdict == UNDECIDED and self.late else ""
         outcome = {"answer": verdict, "reason": reason, "pictures": len(values), "spp": spp, "interval": interval}
@@ -197,6 +203,7 @@ class Trial:
         problem = problem_on(parts, differentiated=False)
         u = problem.domain.project(example.configuration(problem.domain.start))
         count, tried, right, label, picture = TRIALS[is_over(config)], 0, 0, "", None
+        wrong_payloads: list[JsonValue] = []
         self.progress.stage(example.name, count, at_most=True)
         kind = f"{'added ' if self.config.add is not None else ''}counterexample {example.name}"
         queries = (
@@ -204,12 +211,15 @@ class Trial:
         )
         for query, evaluation, _ in self._pairs(Journal(self.run, Shared(problem)), queries):
             tried, right = tried + 1, right + evaluation.said.right
+            if not evaluation.said.right:
+                wrong_payloads.append(evaluation.said.payload)
             if not evaluation.said.right and not label:
                 label, picture = evaluation.said.prediction.label, self._picture(example.name, problem, query)
             if 0 < right < tried:
                 break  # it depends on the noise, whatever comes
         interval = clopper_pearson(right, tried) if tried else None
-        verdict, reason = words.tried_reason(right, tried - right, label, interval)
+        outcomes = outcomes_text(count_outcomes(wrong_payloads), problem.task.name)
+        verdict, reason = words.tried_reason(right, tried - right, label, interval, outcomes)
         if tried < count and not 0 < right < tried:
             verdict, reason = UNDECIDED, TIME_OVER
         outcome = {"answer": verdict, "reason": reason, "pictures": tried, "spp": example.spp, "picture": picture}

@@ -19,8 +19,17 @@ from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim
 from advsearch.report.shown import Claim, InNotebook, Kind, Picture, ResultPart, ShownResult
-from advsearch.report.wording import count, interval_text, number_text, percent, seconds_text, short_name, with_article
-from advsearch.runs.results import INTERRUPTED, RUNNING, Fields, Interval, JsonFloat, RunResult, optional
+from advsearch.report.wording import (
+    count,
+    interval_text,
+    number_text,
+    outcomes_text,
+    percent,
+    seconds_text,
+    short_name,
+    with_article,
+)
+from advsearch.runs.results import INTERRUPTED, RUNNING, Fields, Interval, JsonFloat, RunResult, VerifiedRate, optional
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"
 VERDICTS = (HELD, UNDECIDED, FAILED)  # from the best to the worst
@@ -136,10 +145,14 @@ def statement(claim: AnyClaim, config: SceneConfig) -> str:
     return f"no search finds a picture that {short_name(config.model)} gets wrong: {what}{within}"
 
 
-def share_reason(what: str, verdict: str, right: int, pictures: int, interval: tuple[float, float], worst: str) -> str:
+def share_reason(
+    what: str, verdict: str, right: int, pictures: int, interval: tuple[float, float], worst: str, outcomes: str = ""
+) -> str:
     """Return why a claim about a share is held, failed or undecided, with the interval at all times together. `what` is
-    so in `right` of the pictures; `worst` says where it was not, and is empty where it always was."""
+    so in `right` of the pictures; `worst` says where it was not, and is empty where it always was. `outcomes` says what
+    became of the object in the other pictures where a detector is judged."""
     said = f"{what} in {right} of {pictures} (interval {interval_text(interval)})" if pictures else "no picture"
+    said += f"; {outcomes}" if outcomes else ""
     more = f"; not decided after {count(pictures, 'picture')}" if verdict == UNDECIDED else ""
     return said + more + (f"; {worst}" if worst else "")
 
@@ -162,10 +175,11 @@ def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, s
     verified, clean = summary.verified, summary.clean.control
     if summary.ending == "already wrong":
         right = "" if clean is None else f": right in {clean.correct} of {clean.trials} trials"
+        if clean is not None and clean.outcomes:
+            right += f", {outcomes_text(clean.outcomes, summary.task)}"
         return FAILED, f"wrong on the clean scene already{right}"
     if summary.ending == "found" and verified is not None:
-        label = next(iter(verified.labels), "")
-        called = f", most often {with_article(label)}" if label else ""
+        called = how_wrong(summary.task, verified)
         wrong = (
             f"wrong in {verified.successes} of {verified.trials} trials (interval {interval_text(verified.interval)})"
         )
@@ -181,14 +195,26 @@ def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, s
     return HELD, f"not broken by {count(summary.steps, 'step')} of {summary.policy}{beside}; this is no proof"
 
 
-def tried_reason(right: int, wrong: int, label: str, interval: tuple[float, float] | None) -> tuple[str, str]:
+def how_wrong(task: str, verified: VerifiedRate) -> str:
+    """Return what the model most often says in trials that are successes, as the end of a sentence."""
+    label = next(iter(verified.labels), "")
+    if verified.outcomes:
+        return f": {outcomes_text(verified.outcomes, task)}"
+    return f", most often {with_article(label)}" if label else ""
+
+
+def tried_reason(
+    right: int, wrong: int, label: str, interval: tuple[float, float] | None, outcomes: str = ""
+) -> tuple[str, str]:
+    """Return the verdict on a counterexample that was tried again, and why; `label` is the first wrong prediction, and
+    `outcomes` says what became of the object in the wrong ones where a detector is judged."""
     if interval is None:
         return UNDECIDED, TIME_OVER
     if not wrong:
         return HELD, f"right in {right} of {right} trials (interval {interval_text(interval)})"
     low, high = interval
     said = f"wrong in {wrong} of {right + wrong} trials (interval {interval_text((1.0 - high, 1.0 - low))})"
-    said = f"{said}, {with_article(label)}"
+    said = f"{said}: {outcomes}" if outcomes else f"{said}, {with_article(label)}"
     return (UNDECIDED, f"{said}: it depends on the noise") if right else (FAILED, said)
 
 

@@ -59,10 +59,12 @@
   }
   const percent = (share, most) => (share === null ? "none" : `${percentNumber(share, most)}\u00a0%`);
   // A prediction with its number, by what judges it: as `cells` there.
-  function said(task, label, share) {
+  function said(task, label, share, outcome) {
     if (share === null) return label;
-    if (task === "detection") return label.startsWith("no ") ? `${label} found (best score of ${label.slice(3)} ${share.toFixed(2)})` : `${label} (score ${share.toFixed(2)})`;
-    return task === "segmentation" ? `accuracy ${percent(share)}, most often ${label}` : `${label} ${percent(share, 1)}`;
+    const missed = outcome === "missed";
+    if (task === "detection") return missed ? `${label} found (best score ${share.toFixed(2)})` : `${label} (score ${share.toFixed(2)})`;
+    if (task === "segmentation") return missed ? `${label} found, accuracy ${percent(share)}` : outcome === "loose" ? `${label}, accuracy ${percent(share)}` : `accuracy ${percent(share)}, most often ${label}`;
+    return `${label} ${percent(share, 1)}`;
   }
   const short = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(4))));
   // The last part of each path, with as much before it as tells it from the others; names stay as they are.
@@ -174,8 +176,9 @@
       this.count = 0;
       this.parameters = [];
       this.answers = [];
+      this.outcomes = [];
       this.sources = [];
-      this.columns = { step: new Uint32Array(0), unit: new Uint32Array(0), margin: new Float32Array(0), answer: new Uint16Array(0), probability: new Uint16Array(0), right: new Uint8Array(0), source: new Uint16Array(0), boxes: null, others: null };
+      this.columns = { step: new Uint32Array(0), unit: new Uint32Array(0), margin: new Float32Array(0), answer: new Uint16Array(0), outcome: new Uint16Array(0), probability: new Uint16Array(0), right: new Uint8Array(0), source: new Uint16Array(0), boxes: null, others: null };
       this.things = [];
     }
 
@@ -202,6 +205,9 @@
       if (arrays.others) this.addOthers(arrays, this.places(this.things, head.things), before, count);
       this.columns.answer = grown(this.columns.answer, Uint16Array);
       this.put(this.columns.answer, arrays.answer, this.places(this.answers, head.answers), before);
+      this.columns.outcome = grown(this.columns.outcome, Uint16Array);
+      if (arrays.outcome) this.put(this.columns.outcome, arrays.outcome, this.places(this.outcomes, head.outcomes), before);
+      else this.columns.outcome.fill(this.places(this.outcomes, [""])[0], before); // older files have none
       head.parameters.forEach((given, number) => {
         const names = given.levels !== null;
         let mine = this.parameters.find((one) => one.name === given.name && (one.levels !== null) === names);
@@ -477,7 +483,7 @@
     }
 
     groups() {
-      return [["", "nothing"], ["prediction", "prediction"], ["verdict", "right or wrong"], ...this.axes.map((axis) => [axis.name, axis.name])];
+      return [["", "nothing"], ["prediction", "prediction"], ["verdict", "right or wrong"], ...(this.table.outcomes.some(Boolean) ? [["outcome", "what becomes of it"]] : []), ...this.axes.map((axis) => [axis.name, axis.name])];
     }
 
     // Counts over up to three axes, the last one fastest; kept until other rows are chosen.
@@ -803,8 +809,9 @@
 
     // A gallery for each value of what is grouped by; the last ones, which have no room, are counted.
     grouped(gallery) {
-      const { answer, right } = this.table.columns, name = this.state.group, axis = this.byName.get(name);
-      const { labels, level } = axis || (name === "verdict" ? { labels: ["wrong", "right", "not judged"], level: right } : { labels: this.table.answers, level: answer });
+      const { answer, outcome, right } = this.table.columns, name = this.state.group, axis = this.byName.get(name);
+      const own = { verdict: { labels: ["wrong", "right", "not judged"], level: right }, outcome: { labels: this.table.outcomes, level: outcome } };
+      const { labels, level } = axis || own[name] || { labels: this.table.answers, level: answer };
       const made = [];
       let shown = 0, left = 0;
       labels.forEach((label, group) => {
@@ -883,8 +890,8 @@
 
     // What was predicted, with its probability or score: of an object that was missed, the best score that did not count.
     predicted(k) {
-      const { answer, probability, source } = this.table.columns, label = this.table.answers[answer[k]] || "no prediction";
-      return said(this.table.sources[source[k]].task, label, probability[k] === NO_PROBABILITY ? null : probability[k] / 10000);
+      const { answer, outcome, probability, source } = this.table.columns, label = this.table.answers[answer[k]] || "no prediction";
+      return said(this.table.sources[source[k]].task, label, probability[k] === NO_PROBABILITY ? null : probability[k] / 10000, this.table.outcomes[outcome[k]]);
     }
 
     card(k, open) {
