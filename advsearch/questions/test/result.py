@@ -181,15 +181,32 @@ def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, s
     return HELD, f"not broken by {count(summary.steps, 'step')} of {summary.policy}{beside}; this is no proof"
 
 
-def tried_reason(right: int, wrong: int, label: str, interval: tuple[float, float] | None) -> tuple[str, str]:
+def cannot_be_judged(error: str) -> str:
+    return f"its own settings do not fit to this model: {error}"
+
+
+def tried_reason(
+    verdict: str, counts: tuple[int, int, int], label: str, interval: tuple[float, float] | None, *, over: bool
+) -> str:
+    """Return why a counterexample is held, failed or undecided. The counts are trials in which the model is right, in
+    which it is wrong, and which do not count; the interval is that of the share of right ones."""
+    right, wrong, uncounted = counts
+    total = right + wrong
+    what = "conditions in which the clean scene is right" if over else "trials"
     if interval is None:
-        return UNDECIDED, TIME_OVER
+        if over and uncounted:
+            return f"none of {uncounted} conditions counts: the clean scene is wrong, or the object not to be seen"
+        return "nothing of the object is to be seen" if uncounted else TIME_OVER
     if not wrong:
-        return HELD, f"right in {right} of {right} trials (interval {interval_text(interval)})"
-    low, high = interval
-    said = f"wrong in {wrong} of {right + wrong} trials (interval {interval_text((1.0 - high, 1.0 - low))})"
-    said = f"{said}, {with_article(label)}"
-    return (UNDECIDED, f"{said}: it depends on the noise") if right else (FAILED, said)
+        text = f"right in {right} of {right} {what} (interval {interval_text(interval)})"
+    else:
+        low, high = interval
+        ends = interval_text((1.0 - high, 1.0 - low))
+        text = f"wrong in {wrong} of {total} {what} (interval {ends}), {with_article(label)}"
+    if verdict == UNDECIDED and right and wrong:
+        text += ": it depends on the conditions" if over else ": it depends on the noise"
+    why = "the clean scene is wrong, or the object not to be seen" if over else "the object is not to be seen"
+    return text + (f"; {uncounted} more are not counted, as {why}" if uncounted else "")
 
 
 def table_rows(result: SuiteResult) -> list[list[str]]:
