@@ -23,6 +23,7 @@ from advsearch.questions.report.evidence import (
     photo_claims,
     warnings_over,
 )
+from advsearch.questions.report.recorded import RecordedSettings
 from advsearch.questions.report.result import Evidence, evidence_page, markdown
 from advsearch.report.shown import ENDED, NO_PROOF, NOTHING, Claim
 from advsearch.runs.results import Result
@@ -54,6 +55,11 @@ def everything() -> Iterator[tuple[str, dict[str, Any] | None, Result]]:
             tested = [{"model": "reference", "ending": ending, "verified": rate}]
             row = {**samples.MATRIX["table"][0], "tested": tested}
             yield ending, rate, samples.matrix(table=[row])
+
+
+def own(values: dict[str, Any]) -> list[RecordedSettings]:
+    """The settings that a run of a mug recorded."""
+    return [RecordedSettings("", {"object": "mug", **values})]
 
 
 def nothing(claim: Claim) -> bool:
@@ -147,7 +153,7 @@ def test_runs_of_other_models_or_of_a_file_that_changed_are_told() -> None:
 
 def test_page_and_markdown_have_every_claim_and_exclusion_and_no_markup_of_others() -> None:
     result = samples.attack(object="<b>mug</b>", warnings=["*loud* <script>"], ending="budget spent")
-    run = evidence_of("mug-001", result, claims_of(result), {"controls": {"texture": {}}}, {"torch": "2"})
+    run = evidence_of("mug-001", result, claims_of(result), own({"controls": {"texture": {}}}), {"torch": "2"})
     evidence = Evidence(runs=[run], warnings=["Two models."], rules=list(RULES), version="0")
     page, text = evidence_page(evidence), markdown(evidence)
     assert "<script>" not in page.replace("&lt;script&gt;", "") and "&lt;script&gt;" in page
@@ -159,7 +165,7 @@ def test_page_and_markdown_have_every_claim_and_exclusion_and_no_markup_of_other
 
 def test_a_run_without_what_it_was_made_with_says_so() -> None:
     result = samples.attack()
-    assert "not noted" in str(evidence_of("a", result, claims_of(result), {}, {}).made_with)
+    assert "not noted" in str(evidence_of("a", result, claims_of(result), [], {}).made_with)
 
 
 def test_evidence_says_what_varied_how_far_and_what_judged() -> None:
@@ -168,16 +174,20 @@ def test_evidence_says_what_varied_how_far_and_what_judged() -> None:
     rows = [{**counted, "axis": "environment", "unit": "", "value": name} for name in ("cafe", "canteen")]
     part = {**counted, "axis": "camera.distance", "unit": "object sizes", "value": (1.5, 8.0)}
     swept = samples.sweep(axes=[*rows, part], drawn=drawn, controls=["camera"], sampler="random", grid={})
-    found = evidence_of("a", swept, claims_of(swept), {"trials": 20}, {}, {"iou": 0.5, "confidence": 0.25, "unit": ""})
+    given = {"trials": 20, "task": {"name": "detection", "confidence": 0.25}, "set": {"camera.ev": 11.0}}
+    given["objective"] = "create"
+    found = evidence_of("a", swept, claims_of(swept), own(given), {})
     assert "camera.distance: 1.5 to 30 object sizes, drawn by chance" in found.searched
     assert "environment: cafe, canteen" in found.searched and not any("by default" in line for line in found.searched)
-    assert found.measured["Judged with"] == "iou 0.5, confidence 0.25"
+    assert found.measured["Judged with"] == "detection (iou 0.5, confidence 0.25, suppression 0.5, seek create)"
+    assert found.settings["task"] == found.measured["Judged with"], "also what is default"
+    assert "camera.ev" in found.settings["set"] and "environment" not in found.settings
     assert found.measured["Trials of the worst configuration"] == "20" and "Trials" not in found.measured
     assert "as many in each of the 2 environments" in found.claims[0].statement
     azimuth = {"unit": "degrees", "low": 0.0, "high": 360.0}
     over = {"camera.azimuth": azimuth, "environment.which": {"unit": "name", "names": ["noon", "studio"]}}
     many = samples.attack(over=["camera", "environment"], conditions=over, verified=samples.rated(18, trials=18))
-    found = evidence_of("b", many, claims_of(many), {"labels": "mug,cup", "prompt": "a {}"}, {})
+    found = evidence_of("b", many, claims_of(many), own({"labels": "mug,cup", "prompt": "a {}"}), {})
     assert (found.about["Names of its classes"], found.about["Prompt"]) == ("mug,cup", "a {}")
     assert "camera.azimuth: 0 to 360 degrees, by chance" in found.searched
     assert "environment.which: noon or studio, by chance" in found.searched

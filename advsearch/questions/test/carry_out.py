@@ -30,6 +30,7 @@ from advsearch.runs.store import Store
 from advsearch.viewer.pages import keep_result
 
 NOTE = "suite"  # under which a run's store keeps the suite with its seed, so that it goes on as it began
+SETTINGS_NOTE = "counterexamples"  # under which it keeps what counterexamples are judged with, by name
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,8 @@ def test_from_config(
         raise InputError(f"{config.suite}: {error}") from None
     with RunDirectory.of(config, resumed) as run:
         run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
+        judged_with = {claim.name: claim.config.deciding() for claim in planned if claim.example is not None}
+        run.store.set_note(SETTINGS_NOTE, json.dumps(judged_with))
         for claim in planned:
             run.note_sitting(claim.config)
             tested = None if claim.example is not None else described.claims[claim.name]
