@@ -34,6 +34,7 @@ from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.report.evidence import claims_of
+from advsearch.questions.report.recorded import made_with, recorded_settings
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.test import claims
 from advsearch.questions.test import result as words
@@ -421,6 +422,10 @@ def test_a_counterexample_is_judged_by_its_own_label_and_says_where_a_model_has_
     assert kept["settings"]["label"] is None and kept["settings"]["denoise"] == "none" and "policy" not in kept
     result = carry_out(SuiteConfig(suite=suite, only="counterexamples", run=str(tmp_path / "tried")))
     assert [one.answer for one in result.claims] == ["failed"]
+    recorded = recorded_settings(tmp_path / "tried", result, [])
+    assert [one.source for one in recorded] == ["", "counterexample found"], "and no claim that was not tried"
+    assert recorded[1].values["denoise"] == "none" and recorded[1].as_text()["counterexample found: object"] == "mug"
+    assert "bundled model reference" not in made_with(tmp_path / "tried", [])
     kept["settings"]["label"] = "zebra"
     (folder_of(suite) / "found.json").write_text(json.dumps(kept))
     unknown = carry_out(SuiteConfig(suite=suite, only="counterexamples", run=str(tmp_path / "unknown")))
