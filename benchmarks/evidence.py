@@ -429,7 +429,7 @@ def check(out: Path) -> int:
     bad = lines = shares = 0
     for name, said in sections(text):
         counted = READERS[told[name]["command"]](out / name, told[name])
-        counted.let(asked, *verdict_counts(told[name]["conditions"], evidence["criterion"]))
+        counted.let(asked, *verdict_counts(told[name].get("conditions", []), evidence["criterion"]))
         for line in said:
             lines += 1
             numbers = {one.lstrip("+-") for one in NUMBER.findall(re.sub(r"(\d)-(\d)", r"\1 \2", line))}
