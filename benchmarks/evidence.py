@@ -402,7 +402,7 @@ def sections(text: str) -> Iterator[tuple[str, list[str]]]:
     tell shares."""
     for part in text.split("\n## ")[1:]:
         name, _, rest = part.partition("\n")
-        if name in ("How to read this", "Where it belongs"):
+        if name == "How to read this":
             return
         wanted, lines = True, []
         for line in rest.splitlines():
@@ -411,6 +411,13 @@ def sections(text: str) -> Iterator[tuple[str, list[str]]]:
             elif wanted and line and not line.startswith(("| condition", "| ---", "![", "```", "advsearch ")):
                 lines.append(line.replace("\\", ""))
         yield Path(name.replace("\\", "")).name, lines
+
+
+def verdict_counts(conditions: Sequence[dict[str, Any]], criterion: float) -> tuple[int, int, int, int]:
+    """Count the conditions that meet a criterion, that fall short of it, that are open, and all."""
+    met = sum(one["interval"][0] >= criterion for one in conditions)
+    short = sum(one["interval"][1] < criterion for one in conditions)
+    return met, short, len(conditions) - met - short, len(conditions)
 
 
 def check(out: Path) -> int:
@@ -422,7 +429,7 @@ def check(out: Path) -> int:
     bad = lines = shares = 0
     for name, said in sections(text):
         counted = READERS[told[name]["command"]](out / name, told[name])
-        counted.let(asked)
+        counted.let(asked, *verdict_counts(told[name].get("conditions", []), evidence["criterion"]))
         for line in said:
             lines += 1
             numbers = {one.lstrip("+-") for one in NUMBER.findall(re.sub(r"(\d)-(\d)", r"\1 \2", line))}

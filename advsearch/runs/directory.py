@@ -24,7 +24,7 @@ from advsearch.files import JsonObject, open_regular
 from advsearch.runs import files, store, summary
 from advsearch.runs.files import PART, storage_errors, write_bytes, write_text
 from advsearch.runs.store import Row
-from advsearch.settings import HEADER
+from advsearch.settings import HEADER, settings
 from advsearch.yaml_text import LARGEST
 
 if TYPE_CHECKING:
@@ -180,8 +180,10 @@ class RunDirectory:
         """Note what this sitting is made with, after those before it; refuse files that are other ones now."""
         noted = self.store.noted(summary.MADE_WITH)
         before = noted if isinstance(noted, list) else []
-        now = summary.made_with(config.plain())
-        if changed := summary.changed_file([one for one in before if isinstance(one, dict)], config.plain()):
+        known = {setting.name for setting in settings(type(config))}  # without those that the command does not have
+        values = {name: value for name, value in config.plain().items() if name in known}
+        now = summary.made_with(values)
+        if changed := summary.changed_file([one for one in before if isinstance(one, dict)], values):
             raise InputError(
                 f"{self.path}: cannot resume: {changed} has changed since the run began; restore it, or {self.again}"
             )

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import FileFormatError
 from advsearch.files import opened_for, parse_json, read_bytes, read_text, split_paths
 from advsearch.runs.files import is_held, write_bytes, write_text
@@ -136,23 +137,40 @@ def made_with(settings: Mapping[str, object]) -> dict[str, str]:
 
 BUNDLED = {"objects": "object", "environments": "environment"}
 """Folders of `advsearch.bundled`, and what stands in them."""
+NAMES_BUNDLED = (
+    *("object", "environment", "things", "held_out", "held_out_environment", "grid", "controls", "over", "set"),
+)
+"""Settings that name objects and environments."""
 
 
 def bundled_digests(settings: Mapping[str, object]) -> dict[str, str]:
     """Return the SHA-256 of what is bundled and settings name: objects, environments and the reference model."""
-    package, digests = Path(__file__).parent.parent, dict[str, str]()
-    said = " ".join(str(settings.get(name) or "") for name in ("object", "environment", "things", "held_out", "grid"))
-    words = {*re.findall(r"[a-z][a-z0-9-]*", said), *([] if settings.get("environment") else ["studio"])}
+    package = Path(__file__).parent.parent
+    names = {name for setting in NAMES_BUNDLED for name in _bundled_names(settings.get(setting))}
+    if settings.get("object") and "environment" in settings and not settings["environment"]:
+        names.add(DEFAULT_ENVIRONMENT)
+    digests = dict[str, str]()
     for folder, kind in BUNDLED.items():
         for place in sorted((package / "bundled" / "data" / folder).iterdir()):
-            if place.stem in words:
+            if place.stem in names:
                 files = sorted(place.iterdir()) if place.is_dir() else [place]
                 parts = "".join(f"{file.name} {_digest(file)}\n" for file in files if file.is_file())
                 digests[f"bundled {kind} {place.stem}"] = hashlib.sha256(parts.encode()).hexdigest()
     weights = package / "models" / "data" / "reference.safetensors"
-    if re.search(r"(^|,)reference(,|$)", str(settings.get("model") or "reference")) and weights.is_file():
+    if "reference" in _bundled_names(settings.get("model")) and weights.is_file():
         digests["bundled model reference"] = _digest(weights)
     return digests
+
+
+def _bundled_names(value: object) -> set[str]:
+    """Return what may be the name of something bundled in a setting: the words of ``mug,car@12,3.5; person@6,-2``, in
+    lists and mappings, but for the paths of files."""
+    if isinstance(value, Mapping):
+        return {name for inner in value.values() for name in _bundled_names(inner)}
+    if isinstance(value, (list, tuple)):
+        return {name for inner in value for name in _bundled_names(inner)}
+    words = re.split(r"[,;+]", value) if isinstance(value, str) else []
+    return {word.partition("@")[0].strip() for word in words}
 
 
 def changed_file(before: Sequence[Mapping[str, object]], settings: Mapping[str, object]) -> str | None:

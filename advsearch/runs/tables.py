@@ -31,18 +31,23 @@ NOTE = "units"  # the note of a run that says it
 
 Number = TypeVar("Number", int, npt.NDArray[np.int64])
 
-Count = Annotated[int, Field(strict=True, ge=1)]
+MOST_AXES = 1024
+MOST_ROWS = 1 << 62  # of a whole sweep: numbers of rows are int64
+Count = Annotated[int, Field(strict=True, ge=1, le=MOST_ROWS)]
 
 
 @dataclass(frozen=True)
 class Units:
     """How rows follow from draws."""
 
-    sizes: tuple[Count, ...] = ()  # of the axes of the grid, the last one fastest
+    # of the axes of the grid, the last one fastest
+    sizes: Annotated[tuple[Count, ...], Field(max_length=MOST_AXES)] = ()
     frames: Annotated[int, Field(strict=True, ge=0)] | None = None  # place of the axis whose values are frames
     samples: Count = 1  # draws at each point of the grid
     models: Count = 1  # that are shown the same pictures
-    again: Annotated[int, Field(strict=True, ge=0)] = 0  # pictures after which the draws come again; 0 for never
+    again: Annotated[int, Field(strict=True, ge=0, le=MOST_ROWS)] = (
+        0  # pictures after which the draws come again; 0 for never
+    )
 
     @property
     def size(self) -> int:
@@ -75,7 +80,8 @@ def units_of(store: Store) -> Units | None:
         return None
     with suppress(ValidationError):
         units = TypeAdapter(Units).validate_python(noted)
-        if units.frames is None or units.frames < len(units.sizes):
+        has_frames = units.frames is None or units.frames < len(units.sizes)
+        if has_frames and prod(units.sizes) * units.samples * units.models <= MOST_ROWS:
             return units
     raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}")
 

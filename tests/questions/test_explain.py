@@ -181,6 +181,7 @@ def test_the_nearest_right_prediction_differs_in_one_value(
         assert isinstance(high, list) and isinstance(power, list) and min(len(high), len(power)) == 1
         made = pd.DataFrame({"camera.elevation": a, "light.power": b} for a in high for b in power)
         right = made["camera.elevation"] <= HIGH
+        self.count += len(made)
         return made.assign(correct=right, label=np.where(right, "mug", "bowl"))
 
     monkeypatch.setattr(explaining.Renders, "_rendered", rendered)
@@ -194,6 +195,20 @@ def test_the_nearest_right_prediction_differs_in_one_value(
     left = several.total - several.right - 12
     assert f"Of the 12 most typical of {left + 12} failures, {len(several.pairs)} are right" in pairs_text(several)
     assert f"The other {left} were not tried" in pairs_text(several)
+
+
+def test_nothing_is_counted_of_failures_for_which_nothing_was_rendered(
+    swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*given: Any) -> Any:
+        raise InputError("a file names Python code that nobody allowed")
+
+    monkeypatch.setattr(explaining, "carry_out_part", refuse)
+    result = advsearch.explain(swept, confirm=0, pairs=3, clusters=0, run=tmp_path / "run")
+    assert (result.renders, result.pairs_sought, result.pairs) == (0, 0, [])
+    text = str(result)
+    assert "once one parameter is another" not in text and "Nothing was rendered for pair-1" in text
+    assert "once one parameter is another" not in str(result.model_copy(update={"pairs_sought": 3})), "older runs"
 
 
 def test_typical_failures_take_turns_between_rules_and_those_under_none() -> None:

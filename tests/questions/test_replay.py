@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import samples
 import torch
 
 import advsearch
@@ -19,7 +20,7 @@ from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import attack_once, problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.replay import replay
-from advsearch.questions.replay.result import ReplayConfig
+from advsearch.questions.replay.result import ReplayConfig, ReplayResult, replay_text
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_configuration, read_result, write_configuration
@@ -174,6 +175,17 @@ def test_a_configuration_is_a_point_of_the_box(data: Any, tmp_path: Path) -> Non
         read_configuration(tmp_path)
     write_configuration(tmp_path, torch.tensor([0.25, 1.0]).numpy())
     assert read_configuration(tmp_path).tolist() == [0.25, 1.0]
+
+
+def test_nothing_is_counted_of_conditions_that_were_not_rendered() -> None:
+    same = {**samples.REPLAY["table"][0], "way": "as verified"}
+    not_done = samples.REPLAY["table"][1]
+    alone = ReplayResult.of({**samples.REPLAY, "table": [same, not_done]})
+    assert replay_text(alone) == "As verified, the adversarial scene holds; no change was rendered."
+    none = ReplayResult.of({**samples.REPLAY, "table": [not_done, not_done]})
+    assert replay_text(none) == "Nothing was rendered again." and none.brief == ""
+    changed = ReplayResult.of({**samples.REPLAY, "table": [not_done, samples.REPLAY["table"][0]]})
+    assert "scene was not rendered; changed, it holds under 1 of 1 conditions" in replay_text(changed)
 
 
 def test_an_unknown_way_is_refused() -> None:

@@ -11,22 +11,38 @@ from typing import Any
 import pytest
 import samples
 
+from advsearch.controls import CONTROLS
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.compare import CompareConfig
+from advsearch.questions.explain import ExplainConfig
 from advsearch.questions.explain.result import ExplainResult
 from advsearch.questions.harden.result import HardenResult
 from advsearch.questions.photographs.result import PhotoAgreement
 from advsearch.questions.recipe.result import RecipeResult
 from advsearch.questions.replay.result import ReplayResult
 from advsearch.questions.report.evidence import (
+    DOMAIN,
+    OTHER,
     RULES,
+    chosen_axes,
     claims_of,
+    conditions_of,
+    criterion_lines,
+    domain_of,
     evidence_of,
+    part_of_domain,
     photo_claims,
     warnings_over,
 )
+from advsearch.questions.report.recorded import RecordedSettings
 from advsearch.questions.report.result import Evidence, evidence_page, markdown
+from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.test.settings import SuiteConfig
 from advsearch.report.shown import ENDED, NO_PROOF, NOTHING, Claim
 from advsearch.runs.results import Result
-from advsearch.runs.summary import to_json
+from advsearch.runs.summary import bundled_digests, to_json
+from advsearch.scene.settings import SETTINGS
+from advsearch.settings import Config, settings
 
 ENDINGS = (
     *("found", "budget spent", "stalled", "not verified", "already wrong", "non-finite objective", "interrupted"),
@@ -54,6 +70,11 @@ def everything() -> Iterator[tuple[str, dict[str, Any] | None, Result]]:
             tested = [{"model": "reference", "ending": ending, "verified": rate}]
             row = {**samples.MATRIX["table"][0], "tested": tested}
             yield ending, rate, samples.matrix(table=[row])
+
+
+def own(values: dict[str, Any]) -> list[RecordedSettings]:
+    """The settings that a run of a mug recorded."""
+    return [RecordedSettings("", {"object": "mug", **values})]
 
 
 def nothing(claim: Claim) -> bool:
@@ -147,7 +168,7 @@ def test_runs_of_other_models_or_of_a_file_that_changed_are_told() -> None:
 
 def test_page_and_markdown_have_every_claim_and_exclusion_and_no_markup_of_others() -> None:
     result = samples.attack(object="<b>mug</b>", warnings=["*loud* <script>"], ending="budget spent")
-    run = evidence_of("mug-001", result, claims_of(result), {"controls": {"texture": {}}}, {"torch": "2"})
+    run = evidence_of("mug-001", result, claims_of(result), own({"controls": {"texture": {}}}), {"torch": "2"})
     evidence = Evidence(runs=[run], warnings=["Two models."], rules=list(RULES), version="0")
     page, text = evidence_page(evidence), markdown(evidence)
     assert "<script>" not in page.replace("&lt;script&gt;", "") and "&lt;script&gt;" in page
@@ -159,7 +180,7 @@ def test_page_and_markdown_have_every_claim_and_exclusion_and_no_markup_of_other
 
 def test_a_run_without_what_it_was_made_with_says_so() -> None:
     result = samples.attack()
-    assert "not noted" in str(evidence_of("a", result, claims_of(result), {}, {}).made_with)
+    assert "not noted" in str(evidence_of("a", result, claims_of(result), [], {}).made_with)
 
 
 def test_evidence_says_what_varied_how_far_and_what_judged() -> None:
@@ -168,16 +189,20 @@ def test_evidence_says_what_varied_how_far_and_what_judged() -> None:
     rows = [{**counted, "axis": "environment", "unit": "", "value": name} for name in ("cafe", "canteen")]
     part = {**counted, "axis": "camera.distance", "unit": "object sizes", "value": (1.5, 8.0)}
     swept = samples.sweep(axes=[*rows, part], drawn=drawn, controls=["camera"], sampler="random", grid={})
-    found = evidence_of("a", swept, claims_of(swept), {"trials": 20}, {}, {"iou": 0.5, "confidence": 0.25, "unit": ""})
+    given = {"trials": 20, "task": {"name": "detection", "confidence": 0.25}, "set": {"camera.ev": 11.0}}
+    given["objective"] = "create"
+    found = evidence_of("a", swept, claims_of(swept), own(given), {})
     assert "camera.distance: 1.5 to 30 object sizes, drawn by chance" in found.searched
     assert "environment: cafe, canteen" in found.searched and not any("by default" in line for line in found.searched)
-    assert found.measured["Judged with"] == "iou 0.5, confidence 0.25"
+    assert found.measured["Judged with"] == "detection (iou 0.5, confidence 0.25, suppression 0.5, seek create)"
+    assert found.settings["task"] == found.measured["Judged with"], "also what is default"
+    assert "camera.ev" in found.settings["set"] and "environment" not in found.settings
     assert found.measured["Trials of the worst configuration"] == "20" and "Trials" not in found.measured
     assert "as many in each of the 2 environments" in found.claims[0].statement
     azimuth = {"unit": "degrees", "low": 0.0, "high": 360.0}
     over = {"camera.azimuth": azimuth, "environment.which": {"unit": "name", "names": ["noon", "studio"]}}
     many = samples.attack(over=["camera", "environment"], conditions=over, verified=samples.rated(18, trials=18))
-    found = evidence_of("b", many, claims_of(many), {"labels": "mug,cup", "prompt": "a {}"}, {})
+    found = evidence_of("b", many, claims_of(many), own({"labels": "mug,cup", "prompt": "a {}"}), {})
     assert (found.about["Names of its classes"], found.about["Prompt"]) == ("mug,cup", "a {}")
     assert "camera.azimuth: 0 to 360 degrees, by chance" in found.searched
     assert "environment.which: noon or studio, by chance" in found.searched
@@ -194,3 +219,59 @@ def test_predictions_of_several_models_to_the_same_pictures_are_not_counted_toge
     said = [claim for claim in claims_of(swept) if "is right in" in claim.statement]
     assert [claim.extent and claim.extent.total for claim in said] == [20, 20]
     assert [claim.statement.split()[2] for claim in said] == ["first", "second"]
+
+
+def test_a_run_notes_what_is_bundled_and_used_and_nothing_else() -> None:
+    def bundled(config: Config) -> set[str]:
+        known = {one.name for one in settings(type(config))}
+        return {*bundled_digests({name: value for name, value in config.plain().items() if name in known})}
+
+    model = "bundled model reference"
+    assert bundled(AttackConfig(object="mug")) == {"bundled object mug", "bundled environment studio", model}
+    assert bundled(ExplainConfig(sweeps="mug-sweep-001")) == bundled(SuiteConfig(suite="suite.yaml")) == set()
+    assert bundled(CompareConfig(compared="a,b")) == set(), "stored sweeps are read"
+    controls = {"environment": {"which": ["loft", "noon"]}}
+    searched = bundled(
+        AttackConfig(object="my-mug.obj", model="mug.pt2", label="mug", controls=controls, things="car@4,2")
+    )
+    assert searched == {f"bundled {what}" for what in ("environment studio", "environment loft", "environment noon",
+                                                       "object car")}  # fmt: skip
+
+
+def test_settings_are_listed_as_far_as_they_were_used() -> None:
+    listed = RecordedSettings("", {**AttackConfig(object="car", camera="dashcam", set={"ground.kind": "table"}).plain(),
+                                   "command": "attack"}).as_text()  # fmt: skip
+    assert (listed["camera"], listed["set"]) == ("dashcam", '{"ground.kind": "table"}') and listed["seed"] == "0"
+    assert not {"environment", "run", "overwrite", "minimise", "over", "target"} & listed.keys()
+    swept = {**SweepConfig(object="mug").plain(), "command": "sweep"}
+    assert "fps" not in RecordedSettings("", swept).as_text(), "there is no path"
+    assert RecordedSettings("", {**swept, "path": "approach"}).as_text()["fps"] == "2.0"
+    compared = {**CompareConfig(compared="a,b").plain(), "command": "compare"}
+    assert RecordedSettings("b", compared).as_text() == {"b: compared": "a,b"}, "it renders nothing"
+
+
+@pytest.mark.parametrize("name", [*SETTINGS, *CONTROLS])
+def test_every_setting_of_a_scene_has_its_part_of_a_domain(name: str) -> None:
+    assert part_of_domain(name) in (*DOMAIN, OTHER)
+    result = samples.attack(controls=["geometry"], over=[])
+    domain = domain_of(result, own({"set": {name: 1.5}}), [])
+    assert any(f"{name} 1.5" in text for text in domain.values()) or part_of_domain(name) == "surfaces"
+
+
+def test_a_criterion_is_pooled_over_what_was_drawn_only() -> None:
+    counted = {"configurations": 60, "correct": 60, "accuracy": 1.0, "interval": (0.94, 1.0)}
+    bad = {"configurations": 60, "correct": 30, "accuracy": 0.5, "interval": (0.37, 0.63)}
+    rows = [{**counted, "axis": "camera.distance", "unit": "m", "value": 5.0},
+            {**bad, "axis": "camera.distance", "unit": "m", "value": 40.0}]  # fmt: skip
+    chosen = samples.sweep(axes=rows, drawn={}, grid={"camera.distance": 2})
+    assert chosen_axes(chosen) == ["camera.distance"]
+    lines = criterion_lines(claims_of(chosen), conditions_of(chosen), 0.9, chosen_axes(chosen))
+    assert lines[0].startswith(
+        "At least 90 %, each condition by its own 95 % interval: met in 1, not met in 1 and open"
+    )
+    assert lines[1] == "Not met where: camera.distance 40 m." and not any(": met by" in line for line in lines)
+    drawn = samples.sweep(axes=rows, drawn={"camera.distance": {"unit": "m", "low": 5.0, "high": 40.0}}, grid={})
+    assert chosen_axes(drawn) == []
+    assert "configurations in which the model is right" in criterion_lines(claims_of(drawn), [], 0.9)[0]
+    explained = claims_of(ExplainResult.of(samples.EXPLAIN))
+    assert "that were chosen: others give another share" in criterion_lines(explained, [], 0.9, ["camera.distance"])[0]

@@ -43,7 +43,9 @@ def test_a_run_notes_its_units_and_what_is_none_is_refused(tmp_path: Path) -> No
         assert units_of(store) is None
         store.set_note(NOTE, json.dumps(asdict(Units((3, 5), 1, 2, 2, 60))))
         assert units_of(store) == Units((3, 5), 1, 2, 2, 60)
-        for text in ("[]", '{"sizes": 3}', '{"sizes": [3], "models": 0}', '{"sizes": ["a"]}'):
+        huge = {"sizes": [10**30]}, {"sizes": [1 << 40] * 4}, {"again": 10**30}, {"sizes": [1] * 5000}
+        none = ("[]", '{"sizes": 3}', '{"sizes": [3], "models": 0}', '{"sizes": ["a"]}')
+        for text in (*none, *map(json.dumps, huge), json.dumps({"sizes": [9], "samples": 1 << 61})):
             store.set_note(NOTE, text)
             with pytest.raises(FileFormatError, match="what units of sampling are"):
                 units_of(store)

@@ -118,7 +118,7 @@ def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
         importance=importance,
         envelope=box,
         pairs=pairs,
-        pairs_sought=min(config.pairs, counted.total - counted.right),
+        pairs_sought=renders.pairs_sought,
         clusters=clusters,
         renders=renders.count,
         warnings=[*renders.warnings, *findings.cautions(table, importance)],

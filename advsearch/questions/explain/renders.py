@@ -209,6 +209,7 @@ class Renders:
     rows: pd.DataFrame
     table: pd.DataFrame
     count: int = 0
+    pairs_sought: int = 0  # failures for which pictures were rendered
     interrupted: bool = False
     warnings: list[str] = field(default_factory=list)
 
@@ -275,6 +276,7 @@ class Renders:
         for number, (place, conditions) in enumerate(failures, start=1):
             first = [condition.factor for condition in conditions]
             others = [[factor] for factor in self.table.attrs["units"] if factor not in first]
+            self._is_counted = False  # this failure, in `pairs_sought`
             for factors in (first, *others):
                 near = [pair for factor in factors if (pair := self._nearest(f"pair-{number}", place, factor))]
                 if near:
@@ -295,6 +297,8 @@ class Renders:
             if rows is None:
                 return None
             passes.append(rows)
+        self.pairs_sought += not self._is_counted
+        self._is_counted = True
         first, second = passes
         own, values = row[factor], first[factor].tolist()
         start, right = values.index(own), np.asarray(first["correct"] & second["correct"])

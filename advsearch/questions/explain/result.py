@@ -139,7 +139,8 @@ class ExplainResult(RunResult, RightOf):
     envelope: EnvelopeRow | None = Field(description="null where no box promises it")
     pairs: list[NearestRight]
     pairs_sought: int = Field(
-        default=0, description="failures for which one was looked for, the most typical; others are left out"
+        default=0,
+        description="failures for which one was looked for by renders, the most typical; others are left out",
     )
     clusters: FailureClusters | None = Field(default=None, description="null where nothing was rendered for them")
     renders: int = Field(description="pictures that were rendered")
@@ -183,7 +184,7 @@ def shown(result: ExplainResult) -> ShownResult:
         ResultPart.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
         ResultPart("Where it can be relied on", [envelope_text(result)]),
     ]
-    if result.pairs_sought:
+    if result.pairs_sought and result.renders:  # older runs count failures for which nothing could be rendered
         sections.append(ResultPart("One thing changed", [pairs_text(result)]))
     for pair in result.pairs:
         unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""

@@ -104,7 +104,7 @@ class ReplayResult(InNotebook, SceneResult):
     @property
     def brief(self) -> str:
         done = [row for row in self.table if row.ending != NOT_DONE]
-        return f"holds under {sum(row.ending == 'found' for row in done)} of {len(done)}"
+        return f"holds under {sum(row.ending == 'found' for row in done)} of {len(done)}" if done else ""
 
 
 HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % interval", "verdict")
@@ -137,14 +137,14 @@ def claims(result: ReplayResult) -> Iterator[Claim]:
 
 def replay_text(result: ReplayResult) -> str:
     changed = [row for row in result.table[1:] if row.ending != NOT_DONE]
-    if not result.table:
+    if not result.table or (result.table[0].ending == NOT_DONE and not changed):
         return "Nothing was rendered again."
     own = "holds" if result.table[0].ending == "found" else "does not hold"
+    own = "was not rendered" if result.table[0].ending == NOT_DONE else own
     held = [row for row in changed if row.ending == "found"]
     worthless = [row for row in changed if row.ending == "already wrong"]
-    text = (
-        f"As verified, the adversarial scene {own}; changed, it holds under {len(held)} of {len(changed)} conditions."
-    )
+    under = f"changed, it holds under {len(held)} of {len(changed)} conditions" if changed else "no change was rendered"
+    text = f"As verified, the adversarial scene {own}; {under}."
     if worthless:
         names = ", ".join(f"{row.way}: {row.condition}" for row in worthless)
         text += f" The clean scene itself fails under {names}, where it says nothing."

@@ -5,25 +5,37 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, cast
 
 from advsearch import __version__, registry
 from advsearch.attacks import clopper_pearson
+from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.files import read_bytes
-from advsearch.options import FROM_RUN
 from advsearch.questions.attack import wording as attack_wording
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.explain.result import ExplainResult, rule_text
 from advsearch.questions.photographs.result import FOLDER, PHOTO, PhotoAgreement
-from advsearch.questions.report.result import CROSSWALK, CROSSWALK_HEADS, ConditionShare, Evidence, EvidenceRun
+from advsearch.questions.report.recorded import (
+    SUITE,
+    RecordedSettings,
+    attacks_read,
+    made_with,
+    noted,
+    own_settings,
+    recorded_settings,
+    stated,
+    sweeps_read,
+    tried_claims,
+)
+from advsearch.questions.report.result import ConditionShare, Evidence, EvidenceRun
 from advsearch.questions.sweep.summary import AxisValue, SweepSummary
+from advsearch.questions.test.result import SuiteResult
 from advsearch.report import wording
 from advsearch.report.shown import Claim, claim, counted, nothing_claimed, share_text
 from advsearch.report.wording import interval_text, number_text, percent
@@ -31,8 +43,9 @@ from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, ty
 from advsearch.runs.results import RUNNING, Interval, Result, VariedValue
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Row, Store
-from advsearch.runs.summary import MADE_WITH, read_result
 from advsearch.runs.summary import NAME as SUMMARY
+from advsearch.runs.summary import read_result
+from advsearch.scene.description import NO_MAP
 from advsearch.settings import read_yaml
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -44,11 +57,12 @@ DOMAIN = {
     "light": ("light", "sky", "exposure", "shadow", "projector", "spot"),
     "weather": ("haze",),
     "road users and things": ("object", "answer", "things", "pose", "body", "occlusion", "contents"),
-    "surfaces": ("texture", "material", "patch", "geometry"),
+    "surfaces": ("texture", "material", "patch", "geometry", "ground"),
     "ways and speeds": ("path",),
     "camera and picture": ("camera", "lens", "sensor", "corruption"),
 }
 """The parts of an operational design domain, and the axes and controls that each is about."""
+OTHER = "other"  # the part of what belongs to none of them
 
 Exposure = Mapping[str, Mapping[str, float]]  # how common the values of axes are: weights by axis and value
 
@@ -100,18 +114,45 @@ def met(criterion: float, interval: Interval) -> str:
     return "met" if interval[0] >= criterion else "not met" if interval[1] < criterion else "open"
 
 
-def criterion_lines(claims: Sequence[Claim], conditions: Sequence[ConditionShare], criterion: float) -> list[str]:
-    """Return what a criterion, that so large a share is right, comes to: of each share of right predictions that is
-    measured, and which conditions fall short. A share of failures has none."""
-    extents = [claim.extent for claim in claims if claim.extent is not None]
-    lines = [
-        f"At least {percent(criterion)}: {met(criterion, extent.interval)} by {extent.count} of {extent.total} "
-        f"{extent.what}, 95 % interval {interval_text(extent.interval)}."
-        for extent in extents
-        if "right" in extent.what or "held-out" in extent.what
-    ]
-    short = [row.condition for row in conditions if met(criterion, row.interval) == "not met"]
-    return lines + ([f"Not met where: {', '.join(short)}."] if short else [])
+def chosen_axes(result: Result) -> list[str]:
+    """Return the axes of a sweep whose several values somebody chose: they are not drawn, so that a share over them is
+    one of these values."""
+    if not isinstance(result, SweepSummary):
+        return []
+    counts = Counter(row.axis for row in result.axes if row.axis not in result.drawn)
+    return [axis for axis, count in counts.items() if count > 1 and axis not in ("model", "answer")]
+
+
+def criterion_lines(
+    claims: Sequence[Claim], conditions: Sequence[ConditionShare], criterion: float, chosen: Sequence[str] = ()
+) -> list[str]:
+    """Return what a criterion, that so large a share is right, comes to. A share of failures has none.
+
+    Where the values of axes are `chosen`, each condition is judged by itself: a share over all of them would change
+    with the choice. Without conditions, the share says that it is over these values.
+    """
+    lines = []
+    if not (chosen and conditions):
+        over = f" Over the values of {', '.join(chosen)} that were chosen: others give another share." if chosen else ""
+        lines = [
+            f"At least {percent(criterion)}: {met(criterion, extent.interval)} by {extent.count} of {extent.total} "
+            f"{extent.what}, 95 % interval {interval_text(extent.interval)}.{over}"
+            for extent in (claim.extent for claim in claims if claim.extent is not None)
+            if "right" in extent.what or "held-out" in extent.what
+        ]
+    verdicts = {row.condition: met(criterion, row.interval) for row in conditions}
+    if chosen and conditions:
+        named = ", ".join(chosen)
+        counts = Counter(verdicts.values())
+        lines.append(
+            f"At least {percent(criterion)}, each condition by its own 95 % interval: met in {counts['met']}, not met "
+            f"in {counts['not met']} and open in {counts['open']} of {len(verdicts)}. There is no verdict over all: "
+            f"the values of {named} were chosen."
+        )
+    for verdict in ("not met", "open") if chosen else ("not met",):
+        if where := [condition for condition, told in verdicts.items() if told == verdict]:
+            lines.append(f"{verdict.capitalize()} where: {', '.join(where)}.")
+    return lines
 
 
 def read_exposure(path: str) -> dict[str, dict[str, float]]:
@@ -159,26 +200,44 @@ def exposure_lines(result: Result, conditions: Sequence[ConditionShare], exposur
     return lines
 
 
-def domain_of(result: Result, settings: Mapping[str, object], searched: Sequence[str]) -> dict[str, str]:
+def domain_of(result: Result, recorded: Sequence[RecordedSettings], searched: Sequence[str]) -> dict[str, str]:
     """Return what an operational design domain consists of, in words: within what each part varied, or what it was."""
-    things = [str(getattr(result, "object", "") or ""), str(settings.get("things") or "")]
-    fixed = {
-        "place": str(getattr(result, "environment", "") or settings.get("environment") or ""),
-        "road users and things": "; ".join(filter(None, things)),
-        "camera and picture": str(settings.get("camera") or ""),
-    }
-    moving, domain = [*getattr(result, "controls", ()), *getattr(result, "over", ())], {}
-    for part, names in DOMAIN.items():
-        begins = re.compile(rf"({'|'.join(names)})\b")
-        varied = list(filter(begins.match, searched)) or list(filter(begins.match, moving))
+    fixed = defaultdict[str, list[str]](list)
+    fixed["place"].append(str(getattr(result, "environment", "") or stated(recorded, "environment")))
+    things = filter(None, (str(getattr(result, "object", "") or ""), stated(recorded, "things")))
+    fixed["road users and things"].append("; ".join(things))
+    fixed["camera and picture"].append(stated(recorded, "camera"))
+    values = dict.fromkeys(
+        (str(name), str(value))
+        for settings in recorded
+        if isinstance(given := settings.values.get("set"), Mapping)
+        for name, value in given.items()
+    )
+    for name, value in values:
+        fixed[part_of_domain(name)].append(f"{name} {value}")
+    moving = [*getattr(result, "controls", ()), *getattr(result, "over", ())]
+    domain = dict[str, str]()
+    for part in (*DOMAIN, OTHER):
+        varied = [line for line in searched if part_of_domain(line) == part]
+        varied = varied or [name for name in moving if part_of_domain(name) == part]
         for drive in (getattr(result, "drives", None) or [])[:1] if part == "ways and speeds" else ():
             varied.append(f"{drive.drives} drives of {drive.seconds:g} s, {drive.frames} frames each")
-        alone = f"not varied: {fixed[part]}" if fixed.get(part) else "not varied"
-        domain[part] = "; ".join(varied) or alone
+        was = "; ".join(filter(None, fixed[part]))
+        if part != OTHER or varied or was:
+            domain[part] = "; ".join(varied) or (f"not varied: {was}" if was else "not varied")
     if not domain["place"].startswith("not varied"):
         for part in ("light", "weather"):
             domain[part] = domain[part].replace("not varied", "as each environment has it")
     return domain
+
+
+def part_of_domain(name: str) -> str:
+    """Return the part of a domain that an axis, a control or a parameter of a scene is about."""
+    begins = re.match(r"\w+", name)
+    for part, names in DOMAIN.items():
+        if begins is not None and begins[0] in names:
+            return part
+    return OTHER
 
 
 PICTURES = ("drive", "clean", "adversarial", "worst", "sweep")  # of a run that say most of what it found, best first
@@ -235,14 +294,14 @@ NOT_WEIGHTED = "Nothing is said of how common the conditions are: no weights wer
 
 
 def evidence_of(
-    name: str, result: Result, claims: Sequence[Claim], settings: Mapping[str, object], made: Mapping[str, str],
-    judged_by: Mapping[str, object] | None = None,
-) -> EvidenceRun:  # fmt: skip
-    """Return a run with what a reader needs to judge its claims: settings as its run.yaml has them, versions and
-    digests as it noted them (empty of older runs), and the options of its task, such as thresholds."""
+    name: str, result: Result, claims: Sequence[Claim], recorded: Sequence[RecordedSettings], made: Mapping[str, str]
+) -> EvidenceRun:
+    """Return a run with what a reader needs to judge its claims: the settings that it recorded, its own first, and
+    versions and digests as it noted them (empty of older runs)."""
+    settings = recorded[0].values if recorded else {}
     values = {field: getattr(result, field) for field in type(result).model_fields}
     objects = values.get("object") or ", ".join(values.get("objects") or ())
-    right = values.get("label_set") or settings.get("label")
+    right = values.get("label_set") or stated(recorded, "label", "the object's own label")
     lit_by = str(values.get("environment") or "")
     moving = {name.partition(":")[0] for which in ("over", "controls") for name in values.get(which) or ()}
     if lit_by and {"environment", "sky"} & moving:
@@ -252,10 +311,11 @@ def evidence_of(
         "Object": str(objects or ""),
         "Environment": lit_by,
         "Model": str(values.get("model") or ""),
-        "Names of its classes": str(settings.get("labels") or ""),
-        "Prompt": str(settings.get("prompt") or ""),
+        "Names of its classes": stated(recorded, "labels"),
+        "Prompt": stated(recorded, "prompt"),
         "Task": str(values.get("task") or ""),
-        "Counts as right": ", ".join(right) if isinstance(right, list) else str(right or "the object's own label"),
+        "Judged thing": stated(recorded, "judge"),
+        "Counts as right": ", ".join(right) if isinstance(right, list) else right,
         "Sought": str(values.get("goal") or ""),
     }
     renders, seconds = values.get("renders"), values.get("seconds") or {}
@@ -264,7 +324,8 @@ def evidence_of(
     return EvidenceRun(
         run=name, command=result.command, ending=str(values.get("ending") or "done"), claims=list(claims),
         about={key: text for key, text in about.items() if text}, searched=searched_lines(result, settings),
-        measured=_measured(result, settings, judged_by or {}), excluded=_excluded(result, claims),
+        measured=_measured(result, settings, recorded), excluded=_excluded(result, claims),
+        settings={name: text for one in recorded for name, text in one.as_text().items()},
         cost={
             "Renders": "those of its parts" if renders is None else str(renders),
             "Time": wording.seconds_text(seconds.get("total")),
@@ -314,7 +375,8 @@ def _span(varied: VariedValue) -> str:
     return f"{varied.low:.4g} to {varied.high:.4g} {'' if varied.unit == '1' else varied.unit}".rstrip()
 
 
-def _measured(result: Result, settings: Mapping[str, object], judged_by: Mapping[str, object]) -> dict[str, str]:
+def _measured(result: Result, settings: Mapping[str, object], recorded: Sequence[RecordedSettings]) -> dict[str, str]:
+    tasks = [one.task for one in recorded if one.is_of_scene]
     trials = "Trials of the worst configuration" if isinstance(result, SweepSummary) else "Trials"
     facts = {
         "Policy": getattr(result, "policy", None),
@@ -324,7 +386,7 @@ def _measured(result: Result, settings: Mapping[str, object], judged_by: Mapping
         "Seed": getattr(result, "seed", None),
         "Samples a pixel": getattr(result, "spp", None) or settings.get("spp"),
         trials: settings.get("trials"),
-        "Judged with": ", ".join(f"{name} {number_text(value)}" for name, value in judged_by.items() if value),
+        "Judged with": "; ".join(dict.fromkeys(tasks)),
     }
     named = {name: str(value) for name, value in facts.items() if value not in (None, "")}
     if isinstance(result, AttackSummary) and result.verified is not None:
@@ -359,7 +421,6 @@ def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
     return lines + list(getattr(result, "warnings", ()))
 
 
-SUITE = "suite"  # the note of a run of `test` that has its claims
 MOST_OF_PICTURE = 16 << 20  # bytes of a picture that is taken along
 
 
@@ -372,7 +433,7 @@ def collected(
     models, digests = list[str](), list[str]()
     for folder in map(find_run, runs):
         parts = [part for part in sorted((folder / PARTS).glob("*")) if is_run(part)]
-        of_recipe = parts and _settings(folder).get("command") == "recipe"  # the runs that it consists of
+        of_recipe = parts and own_settings(folder).get("command") == "recipe"  # the runs that it consists of
         folders |= {part.resolve(): part for part in (parts if of_recipe else [folder])}
     for number, folder in enumerate(folders.values(), 1):
         files = [folder / IMAGES / f"{name}.png" for name in PICTURES]
@@ -392,38 +453,21 @@ def collected(
     evidence = Evidence(
         runs=told, warnings=warnings, rules=list(RULES), version=__version__, by=by, criterion=criterion,
         written=f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
-        crosswalk=[dict(zip(CROSSWALK_HEADS, row, strict=True)) for row in CROSSWALK],
     )  # fmt: skip
     return evidence, pictures
 
 
-def _settings(folder: Path) -> Mapping[str, Any]:
-    with suppress(AdvsearchError):
-        return read_yaml(folder / CONFIG)
-    return {}
-
-
-def _noted(folder: Path, note: str) -> Any:
-    with suppress(AdvsearchError), Store(folder / STORE, read_only=True) as store:
-        return store.noted(note)
-    return None
-
-
 def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceRun:
     """One run; of one that has no summary, that it claims nothing."""
-    settings, made_with = _settings(folder), dict[str, dict[str, None]]()
-    noted = _noted(folder, MADE_WITH)  # at each sitting; of several that differ, all
-    for sitting in noted if isinstance(noted, list) else []:
-        for name, text in sitting.items() if isinstance(sitting, Mapping) else ():
-            made_with.setdefault(str(name), {})[str(text)] = None
-    made = {name: ", then ".join(texts) for name, texts in made_with.items()}
+    settings = own_settings(folder)
     if not (folder / SUMMARY).is_file():
         facts = {"Object": str(settings.get("object") or ""), "Model": str(settings.get("model") or "")}
         return EvidenceRun(
             run=typed_name(folder), command=str(settings.get("command") or "unknown"), ending="none yet",
             claims=[nothing_claimed("the run has no result yet: it is still working, or was stopped")],
             about={key: text for key, text in facts.items() if text}, searched=[], measured={}, excluded=[NO_CLAIM],
-            cost={}, made_with=made or {"versions and files": NOT_NOTED},
+            cost={}, made_with=made_with(folder, []) or {"versions and files": NOT_NOTED},
+            settings=RecordedSettings("", settings).as_text(),
             command_line=f"advsearch run {folder / CONFIG}",
         )  # fmt: skip
     result, photographs, rows = read_result(folder), list[Claim](), list[Row]()
@@ -434,18 +478,25 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
         with Store(folder / STORE, read_only=True) as store:
             rows = list(store.rows(PHOTO)) if photographs else []
     claims = [*claims_of(result), *photographs]
-    run = evidence_of(typed_name(folder), result, claims, settings, made, _judged_by(settings.get("task")))
-    outer = _settings(folder.resolve().parent.parent)
+    sweeps = sweeps_read(result)
+    read = [*sweeps, *attacks_read(settings)]
+    recorded = recorded_settings(folder, result, read)
+    made = made_with(folder, read)
+    if getattr(result, "environment", "") == NO_MAP:  # the scene has lights of its own
+        made.pop(f"bundled environment {DEFAULT_ENVIRONMENT}", None)
+    run = evidence_of(typed_name(folder), result, claims, recorded, made)
+    outer = own_settings(folder.resolve().parent.parent)
     few = [QUICK] if outer.get("command") == "recipe" and outer.get("quick") is True else []
     basis = []  # the sweeps whose rows it reads: it is about what varied there
-    sides = [side.run for side in getattr(result, "sides", ())]
-    for name in dict.fromkeys([*getattr(result, "sweeps", ()), *sides]):
+    for path in sweeps:
         with suppress(AdvsearchError):
-            swept = find_run(str(name))
-            basis.append((read_result(swept), _settings(swept)))
-    searched = list(dict.fromkeys(line for read in basis for line in searched_lines(*read)))
-    searched = searched or (_of_a_suite(_noted(folder, SUITE)) if result.command == "test" else run.searched)
-    domain = domain_of(basis[0][0] if basis else result, settings, searched)
+            basis.append((read_result(path), own_settings(path)))
+    searched = list(dict.fromkeys(line for one in basis for line in searched_lines(*one)))
+    if isinstance(result, SuiteResult):
+        searched = _of_a_suite(noted(folder, SUITE), tried_claims(result))
+    searched = searched or run.searched
+    domain = domain_of(basis[0][0] if basis else result, recorded, searched)
+    chosen = list(dict.fromkeys(axis for one in (result, *(swept for swept, _ in basis)) for axis in chosen_axes(one)))
     conditions = conditions_of(result)
     weighted = exposure_lines(result, conditions, exposure)
     compared = sum(claim.extent.total for claim in photographs if claim.extent)
@@ -457,7 +508,7 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
     more = {
         "searched": searched,
         "excluded": [*few, *run.excluded],
-        "criterion": [] if criterion is None else criterion_lines(claims, conditions, criterion),
+        "criterion": [] if criterion is None else criterion_lines(claims, conditions, criterion, chosen),
         "triggering": triggering_conditions(result),
         "exposure": weighted,
         "conditions": conditions,
@@ -468,10 +519,12 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
     return run.model_copy(update=more)
 
 
-def _of_a_suite(suite: Any) -> list[str]:
+def _of_a_suite(suite: Any, tried: Collection[str]) -> list[str]:
     lines = defaultdict[str, list[str]](list)
     try:
         for name, claim in suite["claims"].items():
+            if name not in tried:
+                continue
             settings = {**suite["settings"], **claim["settings"]}
             controls = settings.get("controls") or {}
             if not isinstance(controls, Mapping):
@@ -484,21 +537,3 @@ def _of_a_suite(suite: Any) -> list[str]:
     except (KeyError, AttributeError, TypeError, ValueError):
         return ["as the claims of its suite say, which cannot be read any more"]
     return [f"{line} ({', '.join(names)})" for line, names in lines.items()]
-
-
-def _judged_by(named: Any) -> dict[str, object]:
-    if named is None:
-        return {}
-    from advsearch.tasks import make_task  # they bring torch, which takes a second
-    from advsearch.tasks.together import Together
-
-    with suppress(AdvsearchError):
-        task = make_task(named)
-        alone = {f"{part.name}.": part for part in task.parts} if isinstance(task, Together) else {"": task}
-        return {
-            f"{of}{option.name}": getattr(part, option.name)
-            for of, part in alone.items()
-            for option in fields(part)
-            if option.metadata != FROM_RUN
-        }
-    return {}

@@ -47,6 +47,10 @@ class EvidenceRun(Fields):
     about: dict[str, str] = Field(description="object, environment, model, task and what counts as right")
     searched: list[str] = Field(description="what could change, and how far")
     measured: dict[str, str] = Field(description="policy, seed, samples and the like, by name")
+    settings: dict[str, str] = Field(
+        {}, description="every setting that the run recorded and that says something, by its name; of claims, "
+        "counterexamples and the runs that it read with their names before it"
+    )  # fmt: skip
     excluded: list[str] = Field(description="what was not searched, was rejected, or went wrong")
     cost: dict[str, str] = Field(description="renders and time")
     made_with: dict[str, str] = Field(description="versions, and SHA-256 of files; as the run noted them")
@@ -65,31 +69,6 @@ class Evidence(Result):
     written: str = Field("", description="when, UTC")
     by: str = Field("", description="who, as given; absent otherwise")
     criterion: float | None = optional("share of right predictions that was asked for; absent otherwise")
-    crosswalk: list[dict[str, str]] = Field([], description="which heading of a standard each figure serves")
-
-
-CROSSWALK_HEADS = ("in the evidence", "ISO 21448", "ISO/PAS 8800", "AI Act, article 15")
-# Compared in November 2026 with what is public: article 15 whole; the contents of ISO 21448 (clauses 4 to 8) and of
-# ISO/PAS 8800 (5 to 7), and for its clause 11 a published overview. The other clauses are from memory.
-CROSSWALK = (
-    ("What varied, operational design domain", "5 Specification and design", "9 AI safety requirements; 11 data",
-     "15(4) environment of use"),
-    ("Triggering conditions (rules of explain)", "7 Triggering conditions", "13 safety analysis",
-     "15(4) errors, inconsistencies"),
-    ("Shares by condition, drives, criterion", "6.5 Acceptance criteria; 10 known scenarios", "12 verification",
-     "15(1), 15(3) accuracy"),
-    ("Searches: found and not found", "11 unknown scenarios", "12 verification", "15(5) adversarial examples"),
-    ("Before and after harden", "8 Functional modifications", "10 measures", "15(4) resilience"),
-    ("Exposure", "6.4 Risk evaluation", "13 safety analysis", ""),
-    ("Suites in a pipeline (test)", "13 operation phase", "14 measures in operation", "15(1) through the lifecycle"),
-    ("Excluded, not shown, photographs", "12 achievement", "8 assurance argument", "15(3) instructions of use"),
-    ("Versions, hashes, commands", "9 strategy", "15 confidence in tools", ""),
-)  # fmt: skip
-NO_CONFORMITY = (
-    "The table says under which clause a figure may be read: ISO 21448:2022, ISO/PAS 8800:2024, Regulation (EU) "
-    "2024/1689. Of the two standards only clauses 4 to 8 of ISO 21448, and 11 of ISO/PAS 8800, were compared with "
-    "published contents: compare the others with your edition. It claims no conformity with any of them."
-)
 
 
 def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
@@ -118,7 +97,6 @@ def markdown(evidence: Evidence) -> str:
         if run.command_line:
             lines += ["To repeat it:", "", "```sh", run.command_line.replace("```", "` ` `"), "```", ""]
     lines += ["## How to read this", "", *(f"- {text}" for text in evidence.rules), ""]
-    lines += ["## Where it belongs", "", *table(CROSSWALK_HEADS, CROSSWALK), NO_CONFORMITY, ""]
     return "\n".join([*lines, _signed(evidence)]) + "\n"
 
 
@@ -140,6 +118,7 @@ def sections(run: EvidenceRun) -> dict[str, list[str]]:
         "On what": named(run.about),
         "What varied": run.searched,
         "Measured how": named({"ended as": run.ending, **run.measured}),
+        "Settings": named(run.settings),
         "Excluded, and to be known": run.excluded,
         "Budget": named(run.cost),
         "Made with": [f"begun: {run.begun}"] * bool(run.begun) + named(run.made_with),
@@ -161,8 +140,7 @@ def evidence_page(evidence: Evidence, pictures: Mapping[str, bytes] | None = Non
     main = element(
         "main", *(_run_html(run, pictures or {}) for run in evidence.runs), element("h2", "How to read this"),
         element("ul", *(element("li", text.replace("`", "")) for text in evidence.rules)),
-        element("h2", "Where it belongs"), study_table(CROSSWALK_HEADS, CROSSWALK),
-        element("p", f"{NO_CONFORMITY} {_signed(evidence)}", class_="soft"),
+        element("p", _signed(evidence), class_="soft"),
     )  # fmt: skip
     header = heading(f"evidence; {carried} of {len(claims)} statements carry a claim", said, evidence.warnings)
     return document("evidence", header, main, footer="evidence. This page needs no other file.")

@@ -30,6 +30,7 @@ from advsearch.runs.store import Store
 from advsearch.viewer.pages import keep_result
 
 NOTE = "suite"  # under which a run's store keeps the suite with its seed, so that it goes on as it began
+SETTINGS_NOTE = "counterexamples"  # under which it keeps what counterexamples are judged with, by name
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class PlannedClaim:
     kind: str
     config: SceneConfig
     example: Counterexample | None = None
+    refusal: str = ""  # why a counterexample cannot be tried on the model; its own model's settings stand in `config`
 
 
 def test_from_config(
@@ -71,8 +73,13 @@ def test_from_config(
         raise InputError(f"{config.suite}: {error}") from None
     with RunDirectory.of(config, resumed) as run:
         run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
+        judged_with = {claim.name: claim.config.deciding() for claim in planned if claim.example is not None}
+        run.store.set_note(SETTINGS_NOTE, json.dumps(judged_with))
         for claim in planned:
             run.note_sitting(claim.config)
+            tested = None if claim.example is not None else described.claims[claim.name]
+            if isinstance(tested, NoWorseClaim):
+                run.note_sitting(claim.config.model_copy(update={"model": tested.than}))
         for remark in remarks:
             progress.message(remark)
         trial = Trial(run, config, described, begun, progress, remarks)
@@ -119,6 +126,8 @@ class _SuiteRun:
             return self._not_tried(claim, NOT_TRIED)
         if trial.late:
             return self._not_tried(claim, f"{TIME_OVER} before it began")
+        if claim.refusal:
+            return self._not_tried(claim, claim.refusal)
         asked, begun = self._not_tried(claim, ""), time.perf_counter()
         if claim.example is None:
             tried = trial.claim(asked, trial.suite.claims[claim.name], claim.config)
@@ -170,10 +179,8 @@ class _SuiteRun:
 
 def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) -> list[PlannedClaim]:
     changes = {"model": config.model, "threads": config.threads, "deterministic": config.deterministic or None}
-    planned = [
-        PlannedClaim(example.name, "counterexample", example.config_for(suite, changes), example)
-        for example in (beside.counterexamples(config.suite) if added is None else [added])
-    ]
+    examples = beside.counterexamples(config.suite) if added is None else [added]
+    planned = [_planned_example(example, suite, changes) for example in examples]
     if twice := [example.name for example in planned if example.name in suite.claims]:
         raise InputError(f"claims.{twice[0]}: a counterexample is called so, too; call the claim something else")
     if added is not None:
@@ -186,11 +193,27 @@ def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) ->
         if name not in known:
             raise UnknownNameError("claim in `only`", name, known)
     every = not config.chosen
-    return [
+    chosen = [
         claim
         for claim in planned
         if every or claim.name in config.chosen or (claim.example is not None and COUNTEREXAMPLES in config.chosen)
     ]
+    if not chosen:
+        raise InputError(
+            f"only: expected {COUNTEREXAMPLES} in {beside.folder_of(config.suite)}, got none, so that nothing would be "
+            "tested; keep the adversarial scene of a run with `add`, or leave `only` out"
+        )
+    return chosen
+
+
+def _planned_example(example: Counterexample, suite: Suite, changes: Mapping[str, object]) -> PlannedClaim:
+    refusal = ""
+    try:
+        config = example.config_for(suite, changes)
+    except InputError as error:
+        config = example.config
+        refusal = room.cannot_be_judged(str(error))
+    return PlannedClaim(example.name, "counterexample", config, example, refusal)
 
 
 def _check(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:

@@ -31,12 +31,20 @@ from advsearch.questions.attack.carry_out import executor_for, parts_of, problem
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.test.counterexamples import TRIALS, Counterexample, is_over, scene_digest
+from advsearch.questions.test.counterexamples import (
+    TRIALS,
+    Counterexample,
+    decide_trials,
+    is_over,
+    outcome_of,
+    scene_digest,
+)
 from advsearch.questions.test.result import FAILED, HELD, TIME_OVER, UNDECIDED, ClaimResult
 from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim, ShareClaim
 from advsearch.report.wording import number_text, outcomes_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.settings import split_names
+from advsearch.tasks import Judgement
 
 MANY = 4  # values of a configuration that are said in words, at most
 MOST_KEPT = 64  # of a configuration with more numbers, a picture's row does not hold the values
@@ -196,35 +204,66 @@ class Trial:
     def counterexample(self, asked: ClaimResult, example: Counterexample, config: AttackConfig) -> ClaimResult:
         """Try a counterexample: the model should be right on it. Trials by which it is added are no trials of it."""
         asked = asked.model_copy(update={"statement": f"{config.model} is right where it said {example.said}"})
-        parts = parts_of(config)
+        try:
+            parts = parts_of(config)
+            problem = problem_on(parts, differentiated=False)
+        except InputError as error:
+            return asked.model_copy(update={"reason": words.cannot_be_judged(str(error))})
+        if file := example.changed_file(config):
+            reason = f"the file {file} is another one now; put it back, or remove the counterexample"
+            return asked.model_copy(update={"reason": reason})
         if scene_digest(parts.scene) != example.scene:
             reason = "its scene is another one now; remove it, or add the adversarial scene of a new run"
             return asked.model_copy(update={"reason": reason})
-        problem = problem_on(parts, differentiated=False)
-        u = problem.domain.project(example.configuration(problem.domain.start))
-        count, tried, right, label, picture = TRIALS[is_over(config)], 0, 0, "", None
-        wrong_payloads: list[JsonValue] = []
-        self.progress.stage(example.name, count, at_most=True)
+        start = problem.domain.start
+        u = problem.domain.project(example.configuration(start))
+        over = is_over(config)
+        count = TRIALS[over]
         kind = f"{'added ' if self.config.add is not None else ''}counterexample {example.name}"
-        queries = (
-            Query(u, seeds.stream(problem.seed, kind, number), kind, number, spp=example.spp) for number in range(count)
-        )
-        for query, evaluation, _ in self._pairs(Journal(self.run, Shared(problem)), queries):
-            tried, right = tried + 1, right + evaluation.said.right
-            if not evaluation.said.right:
-                wrong_payloads.append(evaluation.said.payload)
-            if not evaluation.said.right and not label:
-                label, picture = evaluation.said.prediction.label, self._picture(example.name, problem, query)
-            if 0 < right < tried:
-                break  # it depends on the noise, whatever comes
-        interval = clopper_pearson(right, tried) if tried else None
-        outcomes = outcomes_text(count_outcomes(wrong_payloads), problem.task.name)
-        verdict, reason = words.tried_reason(right, tried - right, label, interval, outcomes)
-        if tried < count and not 0 < right < tried:
-            verdict, reason = UNDECIDED, TIME_OVER
-        outcome = {"answer": verdict, "reason": reason, "pictures": tried, "spp": example.spp, "picture": picture}
-        outcome |= {"rate": right / tried if tried else None, "interval": interval}
-        return asked.model_copy(update=outcome)
+        journal = Journal(self.run, Shared(problem))
+        outcomes = list[bool | None]()
+        wrong_payloads: list[JsonValue] = []
+        label = ""
+        picture: str | None = None
+        self.progress.stage(example.name, 4 * count if over else count, at_most=True)
+        for query, trial, clean in self._trials_of(journal, kind, u, example.spp, over=over):
+            outcomes.append(outcome_of(trial, clean))
+            right, wrong = outcomes.count(True), outcomes.count(False)
+            if outcomes[-1] is False:
+                wrong_payloads.append(trial.payload)
+            if outcomes[-1] is False and not label:
+                label, picture = trial.prediction.label, self._picture(example.name, problem, query)
+            if right + wrong == count or (right and wrong and not over):  # of one scene, it depends on the noise then
+                break
+        right, wrong = outcomes.count(True), outcomes.count(False)
+        verdict = decide_trials(right, wrong, over=over)
+        interval = clopper_pearson(right, right + wrong) if right + wrong else None
+        counts = (right, wrong, outcomes.count(None))
+        became = outcomes_text(count_outcomes(wrong_payloads), problem.task.name)
+        reason = words.tried_reason(verdict, counts, label, interval, over=over, outcomes=became)
+        if self.late and right + wrong < count and not (right and wrong and not over):
+            verdict, reason = UNDECIDED, f"{reason}; {TIME_OVER}" if outcomes else TIME_OVER
+        outcome = {"answer": verdict, "reason": reason, "pictures": len(outcomes), "spp": example.spp}
+        outcome |= {"picture": picture, "rate": right / (right + wrong) if right + wrong else None}
+        return asked.model_copy(update={**outcome, "interval": interval})
+
+    def _trials_of(
+        self, journal: Journal, kind: str, u: Tensor, spp: int, *, over: bool
+    ) -> Iterator[tuple[Query, Judgement, Judgement | None]]:
+        """Yield trials of one configuration (d,), and of the clean scene in the same conditions where these vary."""
+        problem = journal.problem
+        queries = list[Query]()
+        for number in range(2 * TRIALS[over]):
+            query = Query(u, seeds.stream(self.suite.seed, kind, number), kind, number, spp=spp)
+            queries.append(query)
+            if over:
+                queries.append(replace(query, u=problem.domain.start, kind=f"{kind}, clean"))
+        evaluated = self._pairs(journal, iter(queries))
+        for query, trial, _ in evaluated:
+            clean = next(evaluated, None) if over else None
+            if over and clean is None:
+                return
+            yield query, trial.said, None if clean is None else clean[1].said
 
     def _problem(self, config: SceneConfig) -> Problem:
         parts = parts_of(AttackConfig.of(config))

@@ -19,19 +19,26 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from advsearch import seeds
+from advsearch.attacks.trials import clopper_pearson
+from advsearch.attacks.verification import LEAST_RATE, OVER_CONDITIONS
 from advsearch.config import SceneConfig
 from advsearch.engine.loading import Scene
+from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import parse_json, read_text
+from advsearch.options import OUT_OF_VIEW
 from advsearch.questions.attack.carry_out import parts_in, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
-from advsearch.questions.test.result import HELD, VERDICTS
-from advsearch.questions.test.settings import OWN, Suite
-from advsearch.runs.directory import CONFIG, IMAGES, PARTS, default_name, find_run
+from advsearch.questions.test.result import FAILED, HELD, UNDECIDED, VERDICTS
+from advsearch.questions.test.settings import Suite
+from advsearch.runs.directory import IMAGES, PARTS, default_name, find_run
 from advsearch.runs.files import read_png, write_bytes, write_text
+from advsearch.runs.summary import changed_file, file_digests
 from advsearch.settings import FILES, settings
+from advsearch.settings.configuration import PLACE
+from advsearch.tasks import Judgement
 from advsearch.viewer.thumbnails import thumbnail
 
 Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
@@ -49,14 +56,21 @@ LARGEST = 1 << 24  # most bytes of a file, and most numbers of a configuration
 MEMORY = 1 << 27  # bytes that unpacking one may take
 TRIALS = {False: 6, True: 20}  # fresh renders that try one, and one that has to hold under many conditions
 
-OF_SEARCH = (
-    *(*OWN, "policy", "steps", "objective", "metrics", "log", "average", "baseline", "trials"),
-    *("measure", "estimators", "specialise", "draws", "aov", "printable", "spp", "verify_spp"),
-)
-"""Settings of a run that say nothing of what its adversarial scene is."""
+OF_MODEL = ("model", "labels", "prompt", "ask", "ensemble")
+"""Settings that say which network is tested. They go together: all are the suite's where it names a model."""
 
-OF_MODEL = ("model", "labels", "prompt", "task", "label")
-"""Settings that a suite says of the model under test, in place of the run's."""
+OF_SUITE = (*PLACE, "threads", "deterministic", "workers", "cluster", "seconds", "log")
+"""Settings that say how and where is worked."""
+
+OF_SEARCH = (
+    *("policy", "steps", "metrics", "average", "baseline", "trials", "measure", "estimator", "draws"),
+    *("aov", "printable", "spp", "verify_spp"),
+)
+"""Settings that say how the adversarial scene was searched for. The samples of its verification are kept apart."""
+
+NOT_DECIDING = frozenset({*OF_SUITE, *OF_SEARCH, "ask"})
+"""The only settings of a run that are not kept with its adversarial scene. Every other one may decide a verdict, so
+that a new setting is kept until somebody lists it here."""
 
 
 class _Block(BaseModel):
@@ -111,6 +125,7 @@ class _File(BaseModel):
     run: str
     said: str
     settings: dict[str, Any]
+    files: dict[str, str] = Field({}, max_length=FEW)
     scene: str
     spp: int = Field(ge=1, le=65536)
     blocks: list[_Block] = Field(min_length=1, max_length=FEW)
@@ -119,24 +134,32 @@ class _File(BaseModel):
 @dataclass(frozen=True)
 class Counterexample:
     """The adversarial scene of a run: its file, beside which its picture is; what it was found with; what the model
-    `said` of it; digest of the scene; samples a pixel that it was verified with; and how far each number (d,) float32
-    is `moved` from the clean scene's."""
+    `said` of it; SHA-256 of the files that its settings name, by name; digest of the scene; samples a pixel that it was
+    verified with; and how far each number (d,) float32 is `moved` from the clean scene's."""
 
     name: str
     path: Path
     config: AttackConfig
     said: str
+    files: Mapping[str, str]
     scene: str
     spp: int
     moved: Floats
 
     def config_for(self, suite: Suite, changes: Mapping[str, object]) -> AttackConfig:
-        of_suite = {name: value for name, value in suite.settings.items() if name in OF_MODEL}
+        """Return what tries it: its own settings, but for the network under test and how the suite works. Raises
+        InputError where its settings do not fit to that network."""
         changed = {name: value for name, value in changes.items() if value is not None}
-        plain = {**self.config.plain(), "run": None}
-        if "model" in {**of_suite, **changed}:
-            plain |= {"labels": None, "prompt": None}
-        return AttackConfig(**{**plain, **of_suite, "seed": suite.seed, **changed})
+        network = {name: value for name, value in {**suite.settings, **changed}.items() if name in OF_MODEL}
+        if "model" not in network:
+            network = {}
+        replaced = (*OF_SUITE, *OF_MODEL) if network else OF_SUITE
+        defaults = {setting.name: setting.default for setting in settings(AttackConfig) if setting.name in replaced}
+        return AttackConfig(**{**self.config.plain(), **defaults, **network, **changed})
+
+    def changed_file(self, config: AttackConfig) -> str | None:
+        """Return the name of a file that its settings name and that is another one now; None where all are the same."""
+        return changed_file([self.files], deciding_settings(config))
 
     def configuration(self, start: Tensor) -> Tensor:
         if start.numel() != len(self.moved):
@@ -160,11 +183,70 @@ def scene_digest(scene: Scene) -> str:
     return digest.hexdigest()
 
 
+def deciding_settings(config: AttackConfig) -> dict[str, Any]:
+    """Return the settings that decide a verdict, but for the network, as JSON values."""
+    left_out = NOT_DECIDING | {*OF_MODEL}
+    return {name: value for name, value in config.plain().items() if name not in left_out}
+
+
+def relative_to_here(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings with the files below the current folder relative to it, so that a suite can be moved."""
+    here = os.getcwd()
+    relative = dict(values)
+    for name in FILES:
+        path = relative.get(name)
+        if isinstance(path, str) and os.path.isabs(path) and Path(path).is_relative_to(here):
+            relative[name] = os.path.relpath(path, here)
+    return relative
+
+
+def outcome_of(trial: Judgement, clean: Judgement | None = None) -> bool | None:
+    """Return whether the model is right in a trial, or None where the trial does not count: nothing of the object is in
+    the picture, or the model is wrong on the clean scene under the same conditions."""
+    if trial.prediction.label == OUT_OF_VIEW or (clean is not None and not clean.right):
+        return None
+    return trial.right
+
+
+def decide_trials(right: int, wrong: int, *, over: bool) -> str:
+    """Return the verdict of the trials that count.
+
+    One scene is held if all are right, and failed if all are wrong. Over conditions a run is found by 90 % of them, so
+    it is held if the model is right in so many, and failed if it is wrong in more than half with 95 % confidence.
+    """
+    total = right + wrong
+    if not over:
+        if total < TRIALS[over] or (right and wrong):
+            return UNDECIDED
+        return HELD if right else FAILED
+    if total and clopper_pearson(wrong, total)[0] >= LEAST_RATE:
+        return FAILED
+    enough = total >= OVER_CONDITIONS.fewest
+    return HELD if enough and right >= OVER_CONDITIONS.share(total) else UNDECIDED
+
+
+def _is_wrong_on(example: Counterexample, problem: Problem, trials: int, *, over: bool) -> bool:
+    """Whether the run's own model fails on what is kept, by trials with fresh seeds."""
+    start = problem.domain.start
+    u = problem.domain.project(example.configuration(start))
+    outcomes = list[bool | None]()
+    for number in range(trials):
+        seed = seeds.stream(problem.seed, "kept", number)
+        judged = [
+            problem.judge(problem.picture(at, seed, example.spp), problem.whole(at, seed))
+            for at in ([u, start] if over else [u])
+        ]
+        outcomes.append(outcome_of(*judged))
+        if outcomes[-1] and not over:
+            return False
+    return decide_trials(outcomes.count(True), outcomes.count(False), over=over) == FAILED
+
+
 def add(suite: str, run: str) -> Counterexample:
     """Keep the adversarial scene of a run as a counterexample of a suite; an InputError where the run found nothing, or
     its scene is none."""
     path = find_run(run)
-    summary, config = attack_of(path), AttackConfig.from_yaml(path / CONFIG)
+    summary = attack_of(path)
     if summary.ending != "found" or summary.verified is None:
         raise InputError(f"add: expected a run that ended as 'found', got {path}, which ended with {summary.ending!r}")
     if summary.minimises:
@@ -174,33 +256,24 @@ def add(suite: str, run: str) -> Counterexample:
     moved = (kept_configuration(path, problem) - problem.domain.start).numpy()
     of = path.parents[1].name if path.parent.name == PARTS else ""
     folder, name = folder_of(suite), default_name(of or path.name, (path.name,) if of else ())
-    # what decides the scene, what may vary in it, and what is right; files below the current folder relative to it
-    plain, here = config.to_repeat().plain(), os.getcwd()
-    kept = {
-        setting.name: plain[setting.name]
-        for setting in settings(AttackConfig)
-        if setting.name not in OF_SEARCH and getattr(config, setting.field) != setting.default
-    }
-    for file in FILES:
-        if isinstance(place := kept.get(file), str) and os.path.isabs(place) and Path(place).is_relative_to(here):
-            kept[file] = os.path.relpath(place, here)
+    config = parts.config.to_repeat()
+    kept = {name: value for name, value in config.plain().items() if name not in NOT_DECIDING}
     values: dict[str, Any] = {"schema": 1, "run": path.name, "said": next(iter(summary.verified.labels), "")}
-    values |= {"settings": kept, "scene": scene_digest(parts.scene), "spp": summary.verified.spp}
+    values["settings"] = relative_to_here(kept)
+    values["files"] = file_digests(relative_to_here(deciding_settings(config)))
+    values |= {"scene": scene_digest(parts.scene), "spp": summary.verified.spp}
     folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / f"{name}{PICTURE}", thumbnail(read_png(path / IMAGES / "adversarial.png")))
     blocks = [block.size for block in problem.domain.blocks]
     forms = FORMS if max(blocks) > FEW else FORMS[-1:]
-    trials = 2 * TRIALS[is_over(config)]  # twice as many as will try it
+    over = is_over(config)
+    trials = TRIALS[over] if over else 2 * TRIALS[over]  # of one scene twice as many as will try it
     for form in forms:
         parted = [_Block.of(part, *form) for part in np.split(moved, np.cumsum(blocks)[:-1])]
         text = json.dumps({**values, "blocks": [block.model_dump() for block in parted]}, indent=1)
         example = _read(write_text(folder / f"{name}.json", text + "\n"))
-        u = problem.domain.project(example.configuration(problem.domain.start))
-        fresh = (seeds.stream(problem.seed, "kept", number) for number in range(trials))
-        if form == forms[-1] or not any(
-            problem.judge(problem.picture(u, seed, example.spp), problem.whole(u, seed)).right for seed in fresh
-        ):
-            break  # the run's model is wrong on what is kept
+        if form == forms[-1] or _is_wrong_on(example, problem, trials, over=over):
+            break
     return example
 
 
@@ -228,7 +301,7 @@ def _read(path: Path) -> Counterexample:
         config = AttackConfig(**kept.settings)
     except InputError as error:
         raise FileFormatError(f"{path}: settings: {error}") from None
-    return Counterexample(path.stem, path, config, kept.said, kept.scene, kept.spp, moved)
+    return Counterexample(path.stem, path, config, kept.said, kept.files, kept.scene, kept.spp, moved)
 
 
 EXPECTED = "expected.json"  # what claims said when that was accepted, where they were not held

@@ -203,19 +203,47 @@ def how_wrong(task: str, verified: VerifiedRate) -> str:
     return f", most often {with_article(label)}" if label else ""
 
 
+def cannot_be_judged(error: str) -> str:
+    return f"its own settings do not fit to this model: {error}"
+
+
 def tried_reason(
-    right: int, wrong: int, label: str, interval: tuple[float, float] | None, outcomes: str = ""
-) -> tuple[str, str]:
-    """Return the verdict on a counterexample that was tried again, and why; `label` is the first wrong prediction, and
-    `outcomes` says what became of the object in the wrong ones where a detector is judged."""
+    verdict: str,
+    counts: tuple[int, int, int],
+    label: str,
+    interval: tuple[float, float] | None,
+    *,
+    over: bool,
+    outcomes: str = "",
+) -> str:
+    """Return why a counterexample is held, failed or undecided.
+
+    Args:
+        verdict: HELD, FAILED or UNDECIDED.
+        counts: trials in which the model is right, in which it is wrong, and which do not count.
+        label: the first wrong prediction.
+        interval: of the share of right trials; None where no trial counts.
+        over: whether conditions vary.
+        outcomes: what became of the object in the wrong trials, where a detector is judged; else empty.
+    """
+    right, wrong, uncounted = counts
+    total = right + wrong
+    what = "conditions in which the clean scene is right" if over else "trials"
     if interval is None:
-        return UNDECIDED, TIME_OVER
+        if over and uncounted:
+            return f"none of {uncounted} conditions counts: the clean scene is wrong, or the object not to be seen"
+        return "nothing of the object is to be seen" if uncounted else TIME_OVER
     if not wrong:
-        return HELD, f"right in {right} of {right} trials (interval {interval_text(interval)})"
-    low, high = interval
-    said = f"wrong in {wrong} of {right + wrong} trials (interval {interval_text((1.0 - high, 1.0 - low))})"
-    said = f"{said}: {outcomes}" if outcomes else f"{said}, {with_article(label)}"
-    return (UNDECIDED, f"{said}: it depends on the noise") if right else (FAILED, said)
+        text = f"right in {right} of {right} {what} (interval {interval_text(interval)})"
+    else:
+        low, high = interval
+        ends = interval_text((1.0 - high, 1.0 - low))
+        text = f"wrong in {wrong} of {total} {what} (interval {ends})"
+        text += f": {outcomes}" if outcomes else f", {with_article(label)}"
+    if verdict == UNDECIDED and right and wrong:
+        text += ": it depends on the conditions" if over else ": it depends on the noise"
+    why = "the clean scene is wrong, or the object not to be seen" if over else "the object is not to be seen"
+    return text + (f"; {uncounted} more are not counted, as {why}" if uncounted else "")
 
 
 def table_rows(result: SuiteResult) -> list[list[str]]:

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -28,22 +29,35 @@ from advsearch.cli.main import main
 from advsearch.cluster import InProcess
 from advsearch.engine.problem import CHANGED, Problem
 from advsearch.errors import AdvsearchError
+from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.report.evidence import claims_of
+from advsearch.questions.report.recorded import made_with, recorded_settings
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.test import claims
 from advsearch.questions.test import result as words
 from advsearch.questions.test.carry_out import test_from_config as carry_out
+from advsearch.questions.test.counterexamples import (
+    NOT_DECIDING,
+    OF_MODEL,
+    OF_SUITE,
+    Counterexample,
+    counterexamples,
+    decide_trials,
+    folder_of,
+    outcome_of,
+)
 from advsearch.questions.test.counterexamples import _Block as Block
-from advsearch.questions.test.counterexamples import counterexamples, folder_of
 from advsearch.questions.test.result import ClaimResult, SuiteResult
-from advsearch.questions.test.settings import NoWorseClaim, SuiteConfig
+from advsearch.questions.test.settings import NoWorseClaim, SuiteConfig, suite_of
 from advsearch.runs.listing import listed_run
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.scene.assets import linear_to_srgb
+from advsearch.settings import Setting, settings
+from advsearch.tasks import Judgement, Prediction
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
 from advsearch.viewer.server import following_page
 
@@ -79,6 +93,9 @@ CLAIMS = {
     "too-few": claim("no_worse", than=EASY, points=20, pictures=9),
     "no-worse": claim("no_worse", than=HARD, points=40, pictures=20),
 }
+
+
+GOOD = CLAIMS["in-front"]
 
 
 @pytest.fixture(scope="module")
@@ -343,6 +360,126 @@ def test_a_counterexample_of_another_scene_or_a_damaged_one_is_said(attacked: Pa
             counterexamples(suite)
 
 
+SETTINGS: dict[str, Any] = {
+    "object": "mug.obj", "environment": "loft", "up": "y", "size": 4.9, "unit": "cm", "camera": "dashcam",
+    "set": {"camera.ev": 11.0}, "things": "person@1,2", "judge": "person", "exposure": -1.5, "resolution": (96, 128),
+    "model": "net.pt2", "ensemble": None, "labels": "coco", "prompt": "a photo of a {}", "ask": {"calls": 5.0},
+    "task": {"name": "detection", "iou": 0.7, "confidence": 0.3}, "label": "person", "controls": {"pose": {}},
+    "texture_resolution": 64, "spp": 4, "denoise": "none", "pixel_sampler": "independent", "seed": 9, "threads": 2,
+    "deterministic": False, "run": "x", "overwrite": True, "epsilon": 0.03, "norm": "l2",
+    "estimator": {"pose": "differences"}, "objective": "create", "specialise": False, "measure": "no",
+    "policy": "random", "steps": 3, "seconds": 20.0, "target": None, "minimise": False, "smallest": False,
+    "printable": True, "aov": "mask", "metrics": {"feature": "own.metrics:seen"}, "log": "wandb",
+    "over": {"camera": {}}, "path": "orbit", "shutter": 0.02, "rolling": 0.03, "draws": 2, "average": 50,
+    "baseline": False, "verify_spp": 32, "trials": 7, "workers": 2, "cluster": "local",
+}  # fmt: skip
+"""A value of each setting of an attack, other than the default where a run with others can have one."""
+
+
+def kept_case(**given: Any) -> Counterexample:
+    config = AttackConfig(**{"object": "mug", **given})
+    return Counterexample("case", Path("case.json"), config, "vase", {}, "", 16, np.zeros(1, np.float32))
+
+
+@pytest.mark.parametrize("setting", settings(AttackConfig), ids=lambda setting: setting.name)
+def test_every_setting_that_decides_a_verdict_is_the_counterexample_s_own(setting: Setting) -> None:
+    """A new setting travels with a counterexample until somebody lists it as one that decides nothing."""
+    assert {one.name for one in settings(AttackConfig)} == {*SETTINGS}
+    wanted = {name: SETTINGS[name] for name in ("object", "controls", "over", "run", setting.name)}
+    suite = suite_of({"settings": {}, "claims": {"a": GOOD}, "seed": 5}, "suite.yaml")
+    judged = kept_case(**wanted).config_for(suite, {})
+    same = getattr(judged, setting.field) == getattr(AttackConfig(**wanted), setting.field)
+    assert same or setting.name in OF_SUITE
+    of_others = {"object": "bowl", "model": "other.pt2", "label": "car", "judge": "all", "task": "classification"}
+    of_others |= {"environment": "noon", "resolution": 64, "camera": "robot", "exposure": 1.0, "set": {}}
+    other = suite_of({"settings": of_others, "claims": {"a": GOOD}}, "suite.yaml")
+    judged = kept_case(**wanted).config_for(other, {"model": None, "threads": 1, "deterministic": None})
+    if setting.name in (*OF_MODEL, *OF_SUITE):
+        assert (judged.model, judged.labels, judged.prompt, judged.threads) == ("other.pt2", None, None, 1)
+    else:
+        assert getattr(judged, setting.field) == getattr(AttackConfig(**wanted), setting.field)
+    listed = {"run", "overwrite", "threads", "deterministic", "workers", "cluster", "seconds", "log", "ask", "policy"}
+    listed |= {"steps", "metrics", "average", "baseline", "trials", "measure", "estimator", "draws", "aov"}
+    assert listed | {"printable", "spp", "verify_spp"} == NOT_DECIDING < {*SETTINGS}
+
+
+def test_a_suite_s_labels_go_with_its_model_alone() -> None:
+    suite = suite_of({"settings": {"labels": "voc"}, "claims": {"a": GOOD}}, "suite.yaml")
+    assert kept_case(model="net.pt2", labels="coco").config_for(suite, {}).labels == "coco"
+    tested = kept_case(model="net.pt2", labels="coco").config_for(suite, {"model": "new.pt2"})
+    assert (tested.model, tested.labels) == ("new.pt2", "voc")
+
+
+def test_a_counterexample_is_judged_by_its_own_label_and_says_where_a_model_has_no_such_class(
+    attacked: Path, tmp_path: Path
+) -> None:
+    suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
+    values = yaml.safe_load(Path(suite).read_text())
+    values["settings"]["label"] = "vase"  # of the claims: by it what the model says of the case would be right
+    Path(suite).write_text(yaml.safe_dump(values))
+    carry_out(SuiteConfig(suite=suite, add=attacked, run=str(tmp_path / "added")))
+    kept = json.loads((folder_of(suite) / "found.json").read_text())
+    assert kept["settings"]["label"] is None and kept["settings"]["denoise"] == "none" and "policy" not in kept
+    result = carry_out(SuiteConfig(suite=suite, only="counterexamples", run=str(tmp_path / "tried")))
+    assert [one.answer for one in result.claims] == ["failed"]
+    recorded = recorded_settings(tmp_path / "tried", result, [])
+    assert [one.source for one in recorded] == ["", "counterexample found"], "and no claim that was not tried"
+    assert recorded[1].values["denoise"] == "none" and recorded[1].as_text()["counterexample found: object"] == "mug"
+    assert "bundled model reference" not in made_with(tmp_path / "tried", [])
+    kept["settings"]["label"] = "zebra"
+    (folder_of(suite) / "found.json").write_text(json.dumps(kept))
+    unknown = carry_out(SuiteConfig(suite=suite, only="counterexamples", run=str(tmp_path / "unknown")))
+    assert unknown.claims[0].answer == "undecided" and unknown.status == 2
+    reason = unknown.claims[0].reason
+    assert "its own settings do not fit to this model" in reason and "zebra" in reason
+
+
+def test_where_there_are_no_counterexamples_none_is_held(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
+    asked = ["test", suite, "--code", EASY, "--only", "counterexamples", "--run", str(tmp_path / "run")]
+    assert main(asked) == 2
+    said = capsys.readouterr()
+    assert "got none, so that nothing would be tested" in said.err and "eld" not in said.out
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_configuration_over_conditions_is_kept_where_it_holds_in_most_of_them(attacked: Path, tmp_path: Path) -> None:
+    run = tmp_path / "over"
+    shutil.copytree(attacked, run)
+    head, _, text = (run / "run.yaml").read_text().partition("\n")
+    over = {"camera": {"azimuth": [-60, 60], "elevation": [0, 60]}}  # in some of which the model is right all the same
+    (run / "run.yaml").write_text(f"{head}\n{yaml.safe_dump({**yaml.safe_load(text), 'over': over})}")
+    suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
+    added = carry_out(SuiteConfig(suite=suite, add=str(run), run=str(tmp_path / "added")))
+    (one,) = added.claims
+    assert added.added and one.answer == "failed" and one.interval is not None and one.interval[1] <= 0.5
+    assert "conditions in which the clean scene is right" in one.reason and 0.0 < (one.rate or 0.0) < 0.3
+    with Store(tmp_path / "added" / "results.sqlite", read_only=True) as store:
+        counts = store.counts()
+    assert counts["added counterexample over"] == counts["added counterexample over, clean"] == one.pictures
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "over", "verdict"),
+    [
+        (6, 0, False, "held"), (0, 6, False, "failed"), (1, 5, False, "undecided"), (3, 0, False, "undecided"),
+        (5, 15, True, "failed"), (0, 6, True, "failed"), (0, 5, True, "undecided"), (6, 14, True, "undecided"),
+        (18, 2, True, "held"), (17, 3, True, "undecided"), (5, 0, True, "undecided"), (0, 0, True, "undecided"),
+    ],
+)  # fmt: skip
+def test_what_trials_say_of_a_counterexample(right: int, wrong: int, over: bool, verdict: str) -> None:
+    assert decide_trials(right, wrong, over=over) == verdict
+
+
+def test_conditions_in_which_the_clean_scene_is_wrong_do_not_count() -> None:
+    right, wrong, hidden = (
+        Judgement(0.0, margin, right=margin > 0.0, prediction=Prediction(label))
+        for margin, label in ((1.0, "mug"), (-1.0, "vase"), (-1.0, OUT_OF_VIEW))
+    )
+    assert [outcome_of(wrong), outcome_of(right), outcome_of(hidden)] == [False, True, None]
+    assert [outcome_of(wrong, right), outcome_of(wrong, wrong), outcome_of(right, hidden)] == [False, None, None]
+
+
 def test_numbers_are_kept_finely_where_they_are_few_and_by_their_signs_on_squares_where_they_are_many() -> None:
     generator = np.random.default_rng(0)
     few = generator.uniform(-0.3, 0.3, 7).astype(np.float32)
@@ -468,8 +605,6 @@ def test_texts_of_others_stay_texts(tested: tuple[SuiteResult, Path]) -> None:
 
 
 # ---- bad suites -----------------------------------------------------------------------------------------------------
-
-GOOD = CLAIMS["in-front"]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,211 @@
+"""The settings that a run recorded: its own, those of its suite's claims, and those of the runs that it read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from advsearch.config import CONFIGS
+from advsearch.errors import AdvsearchError
+from advsearch.options import FROM_RUN
+from advsearch.questions.test.result import NOT_TRIED, NOT_YET, SuiteResult
+from advsearch.report.wording import number_text
+from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, typed_name
+from advsearch.runs.results import Result
+from advsearch.runs.store import NAME as STORE
+from advsearch.runs.store import Store
+from advsearch.runs.summary import MADE_WITH
+from advsearch.settings import Config, read_yaml, settings
+from advsearch.settings.configuration import PLACE
+
+SUITE = "suite"  # the note of a run of `test` that has its claims
+COUNTEREXAMPLES = "counterexamples"  # its note that has their settings, by name
+NOT_SETTINGS = ("schema", "command", "base", *PLACE)
+ATTACKS = ("attack", "adversarial_of", "around")  # settings that name an attack's run
+DEFAULT_TASK = "classification"
+LONGEST = 2000  # characters of a value that are written
+
+
+@dataclass
+class RecordedSettings:
+    """Settings as a file or a note has them, and where they are from: empty for the run's own."""
+
+    source: str
+    values: Mapping[str, Any]
+
+    @property
+    def is_of_scene(self) -> bool:
+        """Whether they describe pictures of a scene, and not only which runs are read."""
+        return bool(self.values.get("object"))
+
+    @property
+    def task(self) -> str:
+        """The task in words, with its thresholds."""
+        return task_text(self.values.get("task") or DEFAULT_TASK, self.values.get("objective"))
+
+    def as_text(self) -> dict[str, str]:
+        """Return every setting that was used, by its name with the source before it."""
+        before = f"{self.source}: " if self.source else ""
+        return {
+            f"{before}{name}": self.task if name == "task" else _short(value)
+            for name, value in self.values.items()
+            if name not in NOT_SETTINGS and self._is_used(name, value)
+        }
+
+    def _is_used(self, name: str, value: object) -> bool:
+        """Whether a setting says anything. What is default says nothing where the command renders nothing, as it names
+        no object, and where it would clash with the other settings if it were given, as `fps` without a path."""
+        defaults = self._defaults
+        is_default = name not in defaults or value == defaults[name]
+        if is_default and (name in self._idle or ("object" in defaults and not self.is_of_scene)):
+            return False
+        return not is_default or not (value is None or value is False or value in ("", {}, [], ()))
+
+    @cached_property
+    def _kind(self) -> type[Config] | None:
+        command = str(self.values.get("command") or "")
+        return CONFIGS[command] if command in CONFIGS else None
+
+    @cached_property
+    def _defaults(self) -> dict[str, Any]:
+        known = settings(self._kind) if self._kind else ()
+        return {setting.name: None if setting.required else setting.default for setting in known}
+
+    @cached_property
+    def _idle(self) -> set[str]:
+        """The settings that would say nothing if they were given."""
+        with suppress(AdvsearchError):
+            if self._kind is not None:
+                given = {name: value for name, value in self.values.items() if name not in NOT_SETTINGS}
+                config = self._kind(**given)
+                return {clash.setting.rstrip("_") for clash in self._kind.clashes if clash.with_others(config)}
+        return set()
+
+
+def task_text(named: Any, objective: object) -> str:
+    """Return a task in words, with all its options, such as thresholds, also those that are default; an objective of
+    its own says what counts as success."""
+    options = ", ".join(f"{option} {number_text(given)}" for option, given in _task_options(named, objective).items())
+    called = str(named.get("name") if isinstance(named, Mapping) else named)
+    return f"{called} ({options})" if options else _short(named)
+
+
+def _short(value: object) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}... ({len(text)} characters)"
+
+
+def _task_options(named: Any, objective: object) -> dict[str, Any]:
+    from advsearch.tasks import make_task  # they bring torch, which takes a second
+    from advsearch.tasks.together import Together
+
+    options = dict[str, Any]()
+    with suppress(AdvsearchError):
+        task = make_task(named)
+        task = task.seeking(objective) if isinstance(objective, str) else task
+        parts = {f"{part.name}.": part for part in task.parts} if isinstance(task, Together) else {"": task}
+        for before, part in parts.items():
+            for option in fields(part):
+                value = getattr(part, option.name)
+                if option.metadata != FROM_RUN and value not in (None, "", (), False):
+                    options[f"{before}{option.name}"] = value
+    return options
+
+
+def own_settings(folder: Path) -> Mapping[str, Any]:
+    """Return what the `run.yaml` of a run says; nothing where it cannot be read."""
+    with suppress(AdvsearchError):
+        return read_yaml(folder / CONFIG)
+    return {}
+
+
+def noted(folder: Path, note: str) -> Any:
+    with suppress(AdvsearchError), Store(folder / STORE, read_only=True) as store:
+        return store.noted(note)
+    return None
+
+
+def sweeps_read(result: Result) -> list[Path]:
+    """Return the folders of the sweeps whose rows a result was made from, as far as they are there."""
+    return _found([*getattr(result, "sweeps", ()), *(side.run for side in getattr(result, "sides", ()))])
+
+
+def attacks_read(values: Mapping[str, Any]) -> list[Path]:
+    """Return the folders of the attacks that settings name, whose adversarial scenes were rendered again."""
+    return _found([values.get(name) for name in ATTACKS])
+
+
+def _found(names: Iterable[object]) -> list[Path]:
+    folders = list[Path]()
+    for name in dict.fromkeys(name for name in names if isinstance(name, str) and name):
+        with suppress(AdvsearchError, OSError, ValueError):
+            folders.append(find_run(name))
+    return folders
+
+
+def recorded_settings(folder: Path, result: Result, read: Sequence[Path]) -> list[RecordedSettings]:
+    """Return the settings of a run: its own, of a suite those of each claim and counterexample that was tried, and
+    those of the runs that it read."""
+    own = own_settings(folder)
+    recorded = [RecordedSettings("", own)]
+    if isinstance(result, SuiteResult):
+        tried = tried_claims(result)
+        recorded += _of_suite(noted(folder, SUITE), tried)
+        recorded += _of_counterexamples(noted(folder, COUNTEREXAMPLES), tried)
+    return recorded + [RecordedSettings(typed_name(path), own_settings(path)) for path in read]
+
+
+def tried_claims(result: SuiteResult) -> set[str]:
+    return {claim.name for claim in result.claims if claim.reason not in (NOT_TRIED, NOT_YET)}
+
+
+def _of_suite(suite: Any, tried: Collection[str]) -> list[RecordedSettings]:
+    recorded = list[RecordedSettings]()
+    with suppress(KeyError, AttributeError, TypeError, ValueError):
+        common = {name: suite[name] for name in ("seed", "confidence") if name in suite}
+        for name, claim in suite["claims"].items():
+            of_claim = {key: value for key, value in claim.items() if key != "settings"}
+            values = {**common, **suite["settings"], **of_claim, **claim["settings"]}
+            if name in tried:
+                recorded.append(RecordedSettings(f"claim {name}", values))
+    return recorded
+
+
+def _of_counterexamples(examples: Any, tried: Collection[str]) -> list[RecordedSettings]:
+    if not isinstance(examples, Mapping):
+        return []
+    return [
+        RecordedSettings(f"counterexample {name}", values)
+        for name, values in examples.items()
+        if name in tried and isinstance(values, Mapping)
+    ]
+
+
+def stated(recorded: Iterable[RecordedSettings], name: str, otherwise: str = "") -> str:
+    """Return what settings of scenes say under a name, each different text once; `otherwise` where one says nothing."""
+    texts = [_short(one.values.get(name) or otherwise) for one in recorded if one.is_of_scene]
+    return "; ".join(dict.fromkeys(filter(None, texts)))
+
+
+def made_with(folder: Path, read: Sequence[Path]) -> dict[str, str]:
+    """Return versions and digests of files, of a run, of the runs that it consists of and of those that it read; of
+    several that differ, all."""
+    found = dict[str, dict[str, None]]()
+    parts = [part for part in sorted((folder / PARTS).glob("*")) if is_run(part)]
+    for sitting in _sittings([folder, *parts, *read]):
+        for name, text in sitting.items():
+            found.setdefault(str(name), {})[str(text)] = None
+    return {name: ", then ".join(texts) for name, texts in found.items()}
+
+
+def _sittings(folders: Sequence[Path]) -> Iterator[Mapping[str, object]]:
+    for folder in folders:
+        sittings = noted(folder, MADE_WITH)
+        for sitting in sittings if isinstance(sittings, list) else []:
+            if isinstance(sitting, Mapping):
+                yield sitting
