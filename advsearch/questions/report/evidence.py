@@ -254,6 +254,7 @@ def evidence_of(
         "Model": str(values.get("model") or ""),
         "Names of its classes": str(settings.get("labels") or ""),
         "Prompt": str(settings.get("prompt") or ""),
+        "Range of its input": "" if settings.get("value_range") is None else str(settings["value_range"]),
         "Task": str(values.get("task") or ""),
         "Counts as right": ", ".join(right) if isinstance(right, list) else str(right or "the object's own label"),
         "Sought": str(values.get("goal") or ""),

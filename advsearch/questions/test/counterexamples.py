@@ -55,7 +55,7 @@ OF_SEARCH = (
 )
 """Settings of a run that say nothing of what its adversarial scene is."""
 
-OF_MODEL = ("model", "labels", "prompt", "task", "label")
+OF_MODEL = ("model", "labels", "prompt", "value_range", "task", "label")
 """Settings that a suite says of the model under test, in place of the run's."""
 
 
@@ -135,7 +135,7 @@ class Counterexample:
         changed = {name: value for name, value in changes.items() if value is not None}
         plain = {**self.config.plain(), "run": None}
         if "model" in {**of_suite, **changed}:
-            plain |= {"labels": None, "prompt": None}
+            plain |= {"labels": None, "prompt": None, "value_range": None}
         return AttackConfig(**{**plain, **of_suite, "seed": suite.seed, **changed})
 
     def configuration(self, start: Tensor) -> Tensor:
