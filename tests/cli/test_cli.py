@@ -187,7 +187,8 @@ def test_bad_input_is_one_line_and_status_2(
         ("add `overwrite=True` or leave `baseline=False` out", "add --overwrite or leave --no-baseline out"),
         ("`controls` key: taken; leave `set` out", "--control key: taken; leave --set out"),
         ("`grid` pose.yaw: several", "--grid pose.yaw: several"),
-        ("model x.pt2: `value_range` is for the network", "model x.pt2: `value_range` is for the network"),
+        ("model x.pt2: `layout` is for the network", "model x.pt2: `layout` is for the network"),
+        ("outputs hardly move; give `value_range=0,255`", "outputs hardly move; give --value-range 0,255"),
     ],
 )
 def test_settings_in_messages_become_flags(message: str, shown: str) -> None:
