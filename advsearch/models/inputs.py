@@ -66,7 +66,7 @@ class EightBitInput(nn.Module):
 def names_of_inputs(network: nn.Module) -> list[str]:
     """Return the names of what a network has to be called with; none where Python cannot tell."""
     if isinstance(network, torch.jit.ScriptModule):
-        taken = network.forward.schema.arguments[1:]
+        taken = network.forward.schema.arguments[1:]  # type: ignore[attr-defined]
         return [one.name for one in taken if not one.has_default_value()]
     try:
         parameters = list(inspect.signature(network.forward).parameters.values())
