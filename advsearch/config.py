@@ -173,6 +173,10 @@ class SceneConfig(Config):
         "a text, for CLIP with {} where the name goes, or several with | between them",
         otherwise="a photo of a {}, or What is this?", metavar="TEXT",
     )
+    value_range: tuple[float, float] | None = setting(
+        None, "model", "which values black and white have in the pictures that the model takes",
+        "LOW,HIGH with LOW below HIGH, such as 0,255", otherwise="what the model says, or 0,1", metavar="LOW,HIGH",
+    )
     ask: dict[str, float] = setting(
         dict, "model",
         "a limit for a model behind an address, such as calls=500: calls (2000), tokens and money of a run, seconds of "
@@ -351,6 +355,18 @@ class SceneConfig(Config):
     def _sides_in_range(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
         if not all(8 <= side <= 4096 for side in value or ()):
             raise ValueError("out of range")
+        return value
+
+    @field_validator("value_range", mode="before")
+    @classmethod
+    def _range_from_text(cls, value: Any) -> Any:
+        return value.split(",") if isinstance(value, str) else value
+
+    @field_validator("value_range")
+    @classmethod
+    def _range_in_order(cls, value: tuple[float, float] | None) -> tuple[float, float] | None:
+        if value is not None and value[0] >= value[1]:
+            raise ValueError("out of order")
         return value
 
     @field_validator("set_", mode="before")

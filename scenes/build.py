@@ -1,27 +1,41 @@
 """Writes advsearch/bundled/data from the generators, or checks that it is what they make.
 
 ``python scenes/build.py`` rewrites every file; ``--check`` writes nothing, names the files that differ and exits 3.
+Processors round differently: numbers may differ by what `GEOMETRY`, `NORMALS`, `LEVELS`, `RADIANCE` and `FACTS` say.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import itertools
 import json
+import math
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
+from PIL import Image
 
 from advsearch.bundled.objects import OBJECTS, ObjectFamily
 from advsearch.scene.assets import Mesh
+from advsearch.scene.importing.hdr import read_exr
 from scenes.environments import ENVIRONMENTS, EnvironmentFamily
 from scenes.files import exr, ply, png
 
+Floats = npt.NDArray[np.float32]
+
 FOLDER = "advsearch/bundled/data"
 DATA = Path(__file__).resolve().parents[1] / FOLDER
+
+GEOMETRY = 1e-5  # of the mesh's largest coordinate; vertices of the person are rounded to 1e-6 when they are made
+NORMALS = 1e-3  # those of small triangles turn by so much where a vertex is moved by 1e-6
+LEVELS = 1  # of 255, in a texture
+RADIANCE = 2e-3  # as a share: two steps of a half
+FACTS = 1e-6  # as a share, of numbers in JSON
 
 
 def object_files(family: ObjectFamily) -> dict[str, bytes]:
@@ -79,15 +93,75 @@ def everything() -> Iterator[tuple[str, bytes]]:
     yield "environments/environments.json", (json.dumps({"schema": 1, "environments": facts}, indent=1) + "\n").encode()
 
 
+def is_close(name: str, stored: bytes, made: bytes) -> bool:
+    """Return whether a stored file is what was made, but for rounding; `name` says what it is."""
+    if stored == made:
+        return True
+    compare = {".ply": _is_close_mesh, ".png": _is_close_image, ".exr": _is_close_map, ".json": _is_close_facts}
+    try:
+        return Path(name).suffix in compare and compare[Path(name).suffix](stored, made)
+    except (ValueError, OSError, RuntimeError):  # a damaged file
+        return False
+
+
+def is_close_vertices(stored: Floats, made: Floats) -> bool:
+    """Return whether vertices (V, 8), position, normal and texture coordinates each, differ by rounding only."""
+    if stored.shape != made.shape:
+        return False
+    difference = np.abs(stored - made)
+    largest = float(np.abs(made[:, :3]).max())
+    return bool(
+        difference[:, :3].max() <= GEOMETRY * largest
+        and difference[:, 3:6].max() <= NORMALS
+        and difference[:, 6:].max() <= GEOMETRY
+    )
+
+
+def _is_close_mesh(stored: bytes, made: bytes) -> bool:
+    end = b"end_header\n"
+    header, _, rest = made.partition(end)
+    stored_header, _, stored_rest = stored.partition(end)
+    count = int(header.partition(b"element vertex ")[2].split(maxsplit=1)[0])
+    size = count * 8 * 4
+    if stored_header != header or stored_rest[size:] != rest[size:]:
+        return False
+    tables = [np.frombuffer(data[:size], "<f4").reshape(count, 8) for data in (stored_rest, rest)]
+    return is_close_vertices(*tables)
+
+
+def _is_close_image(stored: bytes, made: bytes) -> bool:
+    first, second = (np.asarray(Image.open(io.BytesIO(data), formats=["PNG"])).astype(int) for data in (stored, made))
+    return first.shape == second.shape and int(np.abs(first - second).max()) <= LEVELS
+
+
+def _is_close_map(stored: bytes, made: bytes) -> bool:
+    first, second = (np.stack(read_exr(Path("map.exr"), data)[0]).astype(np.float64) for data in (stored, made))
+    return first.shape == second.shape and np.allclose(first, second, rtol=RADIANCE, atol=1e-6)
+
+
+def _is_close_facts(stored: bytes, made: bytes) -> bool:
+    return _is_close_value(json.loads(stored), json.loads(made))
+
+
+def _is_close_value(stored: object, made: object) -> bool:
+    if isinstance(stored, dict) and isinstance(made, dict):
+        return stored.keys() == made.keys() and all(_is_close_value(stored[key], made[key]) for key in made)
+    if isinstance(stored, list) and isinstance(made, list):
+        return len(stored) == len(made) and all(map(_is_close_value, stored, made))
+    if isinstance(stored, float) and isinstance(made, float):
+        return math.isclose(stored, made, rel_tol=FACTS)
+    return type(stored) is type(made) and stored == made
+
+
 def differing() -> list[str]:
-    """Return the files that are missing, left over, or not byte for byte what the generators make."""
+    """Return the files that are missing, left over, or not what the generators make, but for rounding."""
     made = dict(everything())
     there = {p.relative_to(DATA).as_posix() for p in DATA.rglob("*") if p.is_file()} if DATA.is_dir() else set()
     there.discard("objects/person/body.npz")  # `scenes/person.py` makes it, of data that another package carries
     return sorted(
         name
         for name in made.keys() | there
-        if name not in made or name not in there or (DATA / name).read_bytes() != made[name]
+        if name not in made or name not in there or not is_close(name, (DATA / name).read_bytes(), made[name])
     )
 
 

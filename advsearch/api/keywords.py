@@ -137,7 +137,7 @@ def asks(config: type[Config]) -> Callable[[Function], Function]:
 WRITTEN = {
     "controls": "Controls", "over": "Controls", "label": "int | np.integer[Any] | Names | None",
     "resolution": "int | str | tuple[int, int] | None", "set_": "Mapping[str, float | str | Sequence[float]] | None",
-    "estimators": "str | Mapping[str, str]",
+    "estimators": "str | Mapping[str, str]", "value_range": "str | Sequence[float] | None",
 }  # fmt: skip
 """What may be written for some settings beside what they become."""
 LISTED = (*SEVERAL, "prompt", "vary", "ways", "quantities", "samplers", "case", "group")

@@ -74,7 +74,9 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
         told = of is task or (part.labelled and not part.names_from)
         labels, prompt = (config.labels, config.prompt) if told else (None, None)
         model = (lent(MODEL, model) if isinstance(model, str) else None) or model
-        return load_model(model, labels=labels, prompt=prompt, task=part, ask=config.ask)
+        return load_model(
+            model, labels=labels, prompt=prompt, value_range=config.value_range, task=part, ask=config.ask
+        )
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ModelWarning)

@@ -26,6 +26,7 @@ from advsearch.models import exported
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.archive import LARGEST, Archive, open_archive, refused, rewritten_torchscript
 from advsearch.models.guards import try_torchscript
+from advsearch.models.inputs import SIZE_INPUTS, SIZE_TYPES, EightBitInput
 from advsearch.models.labels import names_in
 from advsearch.models.probe import foreign
 from advsearch.models.source import Source, source_of
@@ -121,15 +122,24 @@ def _with_signature(source: Source, program: torch.export.ExportedProgram) -> So
     """Return the source with what the program's signature tells: input size, layout, batch limits, dtype. A program may
     take (N, K, 3, H, W) or (N, K, H, W, 3), all pictures of a rig at once."""
     nodes = {node.name: node for node in program.graph.nodes if node.op == "placeholder"}
-    values = [nodes[key].meta.get("val") for key in program.graph_signature.user_inputs if key in nodes]
+    names = [key for key in program.graph_signature.user_inputs if key in nodes]
+    values = [nodes[key].meta.get("val") for key in names]
     tensors = bool(values) and all(isinstance(value, Tensor) for value in values)
     rig = tensors and len(values) == 1 and values[0].dim() == 5 and isinstance(values[0].shape[1], int)
     if not rig and (not tensors or values[0].dim() != 4 or any(value.dim() != 2 for value in values[1:])):
-        raise ModelError(f"model {source.name}: expected a program with one input, a batch of images of 4 dimensions")
+        raise ModelError(
+            f"model {source.name}: expected a program with one input, a batch of images of 4 dimensions"
+            f"{_second_input(names)}"
+        )
     images = values[0]
-    if not images.is_floating_point():
-        what = "floating-point images as input, got" if rig else "a floating-point image as input, the program takes"
+    eight_bit = images.dtype == torch.uint8 and not rig
+    if not images.is_floating_point() and not eight_bit:
+        what = "floating-point images as input, got" if rig else "an image as input, floating-point or uint8, got"
         raise ModelError(f"model {source.name}: expected {what} {images.dtype}")
+    if len(names) == 2 and names[1] in SIZE_INPUTS and values[1].shape[1] == 2:
+        source = replace(source, size_type=values[1].dtype)
+    else:
+        source = replace(source, takes_more=len(values) > 1, size_type=None)
     picture = images.shape[-3:]
     last = picture[2] == 3 and picture[0] != 3
     height, width = picture[:2] if last else picture[1:]
@@ -139,12 +149,29 @@ def _with_signature(source: Source, program: torch.export.ExportedProgram) -> So
     if not isinstance(batch, int) and (allowed := program.range_constraints.get(batch.node.expr)) is not None:
         low = max(int(allowed.lower), 1)
         high = max(low, int(min(allowed.upper, LARGEST_BATCH)))
-    source = replace(source, dtype=images.dtype, input_size=size, takes_more=len(values) > 1)
+    source = replace(source, input_size=size)
+    source = as_eight_bit(source) if eight_bit else replace(source, dtype=images.dtype)
     if not rig:
         return replace(source, batch_limits=(low, high), layout="NHWC" if last else "NCHW")
     cameras = int(images.shape[1])
     module = AllAtOnce(cast(nn.Module, source.module), cameras, "NKHWC" if last else "NKCHW")
     return replace(source, module=module, batch_limits=(low * cameras, high * cameras))
+
+
+def as_eight_bit(source: Source) -> Source:
+    """Return the source of a network that takes uint8, as one of floating-point pictures from 0 to 255."""
+    return replace(source, module=EightBitInput(source.module), dtype=torch.float32, value_range=(0.0, 255.0))
+
+
+def _second_input(names: list[str]) -> str:
+    """What to do with a network of two inputs, of which the second is not known; "" of others."""
+    if len(names) != 2:
+        return ""
+    return (
+        f"; its second input {names[1][:60]!r} is not known: of two inputs, the second may be the size of the "
+        "pictures, (N, 2) in pixels, (width, height), named 'orig_target_sizes'. Export a network that takes pictures "
+        "alone"
+    )
 
 
 def _damaged(path: Path, kind: str) -> AbstractContextManager[None]:
@@ -168,11 +195,12 @@ class OnnxNetwork(nn.Module):
         self.session, self.new_options = session, new_options
         self.options = new_options()
 
-    def forward(self, images: Tensor) -> Tensor | tuple[Tensor, ...]:
-        """Return the only output, or all of them in their order."""
+    def forward(self, *tensors: Tensor) -> Tensor | tuple[Tensor, ...]:
+        """Return the only output, or all of them in their order, for its inputs in their order."""
         self.options = self.new_options()
-        given = {self.session.get_inputs()[0].name: images.detach().cpu().numpy()}
-        outputs = tuple(torch.from_numpy(output) for output in self.session.run(None, given, self.options))
+        names = [tensor.name for tensor in self.session.get_inputs()]
+        named = {name: tensor.detach().cpu().numpy() for name, tensor in zip(names, tensors, strict=True)}
+        outputs = tuple(torch.from_numpy(output) for output in self.session.run(None, named, self.options))
         return outputs[0] if len(outputs) == 1 else outputs
 
     def stop(self) -> None:
@@ -207,10 +235,16 @@ def load_onnx(path: Path) -> Source:
     inputs = session.get_inputs()
     shape = inputs[0].shape if inputs else []
     fixed = [side for side in shape if isinstance(side, int)]
-    if len(inputs) != 1 or len(shape) != 4 or inputs[0].type not in FLOATS or min(fixed, default=1) < 1:
+    eight_bit = bool(inputs) and inputs[0].type == "tensor(uint8)"
+    is_image = len(shape) == 4 and (eight_bit or inputs[0].type in FLOATS) and min(fixed, default=1) > 0
+    more = inputs[1:]
+    is_size = len(more) == 1 and more[0].name in SIZE_INPUTS and more[0].type in SIZE_TYPES
+    is_size = is_size and len(more[0].shape) == 2 and more[0].shape[1] in (2, None)
+    if not is_image or (more and not is_size):
         got = ", ".join(f"{tensor.name} {tensor.type} {tensor.shape}" for tensor in inputs) or "none"
         raise ModelError(
-            f"model file {path}: expected one input, a batch of floating-point images of 4 dimensions, got {got}"
+            f"model file {path}: expected one input, a batch of floating-point images of 4 dimensions (or of uint8), "
+            f"got {got}{_second_input([tensor.name for tensor in inputs])}"
         )
     layout = "NHWC" if shape[3] == 3 and shape[1] != 3 else "NCHW"
     sides = shape[1:3] if layout == "NHWC" else shape[2:4]
@@ -219,12 +253,14 @@ def load_onnx(path: Path) -> Source:
         written = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", metadata.get("imgsz", ""))
         sides = [int(side) for side in written.groups()] if written else []
         sides = sides if all(sides) else []
-    return Source(
+    source = Source(
         OnnxNetwork(session, runtime.RunOptions),
         path.stem,
         input_size=(sides[0], sides[1]) if sides else None,
         layout=layout,
         labels=names_in(metadata.get("names", "")),
         batch_limits=(shape[0], shape[0]) if isinstance(shape[0], int) else (1, LARGEST_BATCH),
-        dtype=FLOATS[inputs[0].type],
+        dtype=torch.float32 if eight_bit else FLOATS[inputs[0].type],
+        size_type=SIZE_TYPES[more[0].type] if more else None,
     )
+    return as_eight_bit(source) if eight_bit else source

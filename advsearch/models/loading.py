@@ -10,11 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torch import nn
+from torch import Tensor, nn
 
 from advsearch.errors import InputError, ModelError, UnknownNameError, resembling
 from advsearch.models import address, files, reference
 from advsearch.models.guards import WithState, called_under, plainly, turned_by_code
+from advsearch.models.inputs import EightBitInput, WithImageSize
 from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
 from advsearch.models.model import PRESETS, Model, Preprocessing, Read
 from advsearch.models.probe import probe
@@ -141,11 +142,12 @@ def load_model(
         if max_batch is not None and (isinstance(max_batch, bool) or not isinstance(max_batch, int) or max_batch < 1):
             raise InputError(f"max_batch: expected a whole number of at least 1, got {max_batch!r}")
         low, high = source.batch_limits
+        preprocessing = _preprocessing(source, given)
         bare = Model(
-            module=source.module,
+            module=_of_images_alone(source, preprocessing),
             name=name or source.name,
             labels=(),
-            preprocessing=_preprocessing(source, given),
+            preprocessing=preprocessing,
             batch_limits=(low, max(low, min(high, max_batch or high))),
             dtype=source.dtype,
             device=source.device,
@@ -154,6 +156,13 @@ def load_model(
         model = probe(bare, source.labels if names is None else names, origin)
     alone = isinstance(spec, (str, os.PathLike)) and not given and labels is None and name is None
     return replace(model, asked=os.fspath(spec)) if alone else model  # type: ignore[arg-type]
+
+
+def _of_images_alone(source: Source, preprocessing: Preprocessing) -> Callable[[Tensor], Any]:
+    """Return the network of a source as one that is called with pictures alone."""
+    if source.size_type is None or isinstance(source.module, WithState):
+        return source.module
+    return WithImageSize(source.module, source.size_type, preprocessing.layout)
 
 
 def named_code(spec: str) -> str | None:
@@ -209,6 +218,8 @@ def _preprocessing(source: Source, given: Mapping[str, object]) -> Preprocessing
         if any(side != int(side) or side < 1 for side in sides):
             raise InputError(f"input_size: expected whole numbers of at least 1, got {given['input_size']!r}")
         fields["input_size"] = int(sides[0]), int(sides[-1])
+    if source.value_range is not None:
+        fields["value_range"] = source.value_range
     for key in ("mean", "std"):
         value = given.get(key)
         if isinstance(value, str) and value.strip().lower() in PRESETS:  # it fills the other too, if that is not given
@@ -225,12 +236,25 @@ def _preprocessing(source: Source, given: Mapping[str, object]) -> Preprocessing
         if low >= high:
             raise InputError(f"value_range: expected low < high, got {given['value_range']!r}")
         fields["value_range"] = (low, high)
+    if isinstance(source.module, EightBitInput):
+        _check_eight_bit(source.name, fields, given)
     for key, choices in {"layout": ("NCHW", "NHWC"), "channels": ("RGB", "BGR")}.items():
         if key in given:
             fields[key] = str(given[key]).strip().upper()
             if fields[key] not in choices:
                 raise InputError(f"{key}: expected one of {', '.join(choices)}, got {given[key]!r}")
     return Preprocessing(**{key: value for key, value in fields.items() if value})
+
+
+def _check_eight_bit(name: str, fields: Mapping[str, Any], given: Mapping[str, object]) -> None:
+    """Raise InputError where pictures are not to be whole numbers from 0 to 255, of a network that takes these."""
+    wrong = [key for key in ("mean", "std") if key in given]
+    if fields["value_range"] != (0.0, 255.0):
+        wrong.append("value_range")
+    if wrong:
+        raise InputError(
+            f"{wrong[0]}: model {name} takes whole numbers from 0 to 255 (uint8), got {given[wrong[0]]!r}; leave it out"
+        )
 
 
 def _numbers(key: str, value: Any, counts: tuple[int, ...], expected: str) -> tuple[float, ...]:

@@ -258,6 +258,9 @@ class Model:
         return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
 
 
+DETACHING = (torch.Tensor.detach, torch.Tensor.detach_, torch.detach, torch.detach_)
+
+
 class Detaching(TorchFunctionMode):
     """Looks on as a network detaches something, which it may be kept from: then gradients are those of its outputs.
 
@@ -274,7 +277,7 @@ class Detaching(TorchFunctionMode):
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Call torch's function, or return what was to be detached as it is."""
-        if function is torch.Tensor.detach:
+        if function in DETACHING:
             self.seen = self.seen or args[0].requires_grad
             if self.ignored:
                 return args[0]

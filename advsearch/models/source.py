@@ -27,6 +27,7 @@ from torch.nn.parameter import is_lazy
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError, resembling
 from advsearch.files import open_regular
 from advsearch.models.archive import LARGEST
+from advsearch.models.inputs import takes_image_size
 from advsearch.models.model import CPU, GIVEN_BY, Model, Triple, warn
 from advsearch.models.probe import PROGRAMS, first_line
 from advsearch.registry import check_import, current_directory_importable
@@ -95,6 +96,8 @@ class Source:
     device: torch.device = CPU
     reads_text: bool = False  # it is given texts beside the picture
     takes_more: bool = False  # it is called with more than pictures
+    value_range: tuple[float, float] | None = None
+    size_type: torch.dtype | None = None  # in which it takes the size of pictures, see `WithImageSize`
 
 
 def source_of(module: nn.Module, name: str, **fields: Any) -> Source:
@@ -110,6 +113,8 @@ def source_of(module: nn.Module, name: str, **fields: Any) -> Source:
     placed = next((p for p in (*module.parameters(), *module.buffers()) if p.is_floating_point()), None)
     if placed is not None:
         fields = {"dtype": placed.dtype, "device": placed.device, **fields}
+    if takes_image_size(module):
+        fields = {"size_type": torch.int64, **fields}
     return Source(frozen(module, name), name, **fields)
 
 

@@ -159,6 +159,8 @@ def as_flags(setting: Setting, value: Any) -> list[str]:
         return [setting.flag, f"{value['name']}={_flow(options)}"]
     if setting.field == "resolution":
         return ["--resolution", "x".join(str(side) for side in value)]
+    if setting.field == "value_range":
+        return [f"{setting.flag}={','.join(_number(end) for end in value)}"]  # the first may be negative
     return [f"{setting.flag}={_number(value)}"] if str(value).startswith("-") else [setting.flag, _number(value)]
 
 

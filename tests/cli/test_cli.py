@@ -187,7 +187,8 @@ def test_bad_input_is_one_line_and_status_2(
         ("add `overwrite=True` or leave `baseline=False` out", "add --overwrite or leave --no-baseline out"),
         ("`controls` key: taken; leave `set` out", "--control key: taken; leave --set out"),
         ("`grid` pose.yaw: several", "--grid pose.yaw: several"),
-        ("model x.pt2: `value_range` is for the network", "model x.pt2: `value_range` is for the network"),
+        ("model x.pt2: `layout` is for the network", "model x.pt2: `layout` is for the network"),
+        ("outputs hardly move; give `value_range=0,255`", "outputs hardly move; give --value-range 0,255"),
     ],
 )
 def test_settings_in_messages_become_flags(message: str, shown: str) -> None:
@@ -294,7 +295,7 @@ sys.exit(main())
 def test_an_interrupt_that_an_import_swallows_is_not_lost(where: dict[str, str], quiet: list[str]) -> None:
     """Imports of others catch everything, so that what came meanwhile is raised when the stage ends."""
     code = SWALLOWING.replace("{importing}", where["importing"]).replace("{loading}", where["loading"])
-    done = subprocess.run([sys.executable, "-c", code, *quiet], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code, *quiet], capture_output=True, text=True, timeout=600)
     assert done.returncode == 130 and "searched" not in done.stdout + done.stderr
     assert "swallowed" in done.stdout + done.stderr and done.stderr.endswith("advsearch: interrupted\n")
 
@@ -303,7 +304,7 @@ def test_an_interrupted_process_ends_without_the_interpreters_own_end() -> None:
     """What an interrupt inside native code leaves behind aborts there: status 134 and a dump of threads."""
     code = "import atexit, os; from advsearch.cli import main; main._status = lambda given: print('answer') or 130; "
     code += "atexit.register(os.abort); from advsearch.__main__ import start; start()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
     assert (done.returncode, done.stdout, done.stderr) == (130, "answer\n", "")
 
 

@@ -73,5 +73,5 @@ zpty -d shell
 def test_tab_finishes_commands_flags_and_names_in_zsh(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     script("zsh", tmp_path, capsys).rename(tmp_path / "_advsearch")
     line = ["zsh", "-f", "-c", TYPED, "zsh", str(tmp_path)]
-    done = subprocess.run(line, capture_output=True, text=True, check=True, cwd=tmp_path, timeout=60)
+    done = subprocess.run(line, capture_output=True, text=True, check=True, cwd=tmp_path, timeout=600)
     assert done.stdout.split() == ["ready", "attack", "--control", "texture"]

@@ -32,7 +32,7 @@ def in_terminal(run: Path, answers: dict[bytes, bytes], size: tuple[int, int] = 
         command, stdin=theirs, stdout=theirs, stderr=theirs, env={**os.environ, "TERM": "xterm-256color"}
     )
     os.close(theirs)
-    written, answered, end = b"", 0, time.monotonic() + 60
+    written, answered, end = b"", 0, time.monotonic() + 600
     while time.monotonic() < end:
         if not select.select([ours], [], [], 0.2)[0]:
             continue
@@ -46,7 +46,7 @@ def in_terminal(run: Path, answers: dict[bytes, bytes], size: tuple[int, int] = 
                 answered = written.index(question, answered) + len(question)
                 os.write(ours, answer)
     os.close(ours)
-    assert process.wait(timeout=60) == 0
+    assert process.wait(timeout=600) == 0
     return written
 
 

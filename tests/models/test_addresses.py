@@ -325,7 +325,7 @@ def test_a_limit_ends_it(server: Server, ask: dict[str, float], allowed: int, ex
 
 
 class Together:
-    """Says how light a picture is, after others have come or a while has gone by; counts those under way."""
+    """Says how light a picture is, after others have come; counts those under way."""
 
     def __init__(self, enough: int) -> None:
         self.enough, self.now, self.most, self.lock = enough, 0, 0, threading.Condition()
@@ -335,7 +335,7 @@ class Together:
             self.now += 1
             self.most = max(self.most, self.now)
             self.lock.notify_all()
-            self.lock.wait_for(lambda: self.most >= self.enough, timeout=0.3)
+            self.lock.wait_for(lambda: self.most >= self.enough, timeout=60.0)
             self.now -= 1
         usage = {"prompt_tokens": 100, "completion_tokens": 10}
         return {**scores(asked), "usage": usage}

@@ -75,7 +75,7 @@ def test_ctrl_c_leaves_rows_and_resume_ends_with_the_same(
         if "camera.azimuth by" in line:  # the first row
             os.kill(child.pid, signal.SIGINT)
             break
-    said, _ = child.communicate(timeout=120)
+    said, _ = child.communicate(timeout=600)
     assert child.returncode == 130
     assert "Stopped after 0 of 1 parts" in said and said.endswith(f"Go on with: advsearch resume {folder}\n")
     stopped = kept(folder)
@@ -98,7 +98,7 @@ def test_a_kill_leaves_the_rows_that_were_told(tmp_path: Path, whole: CheckResul
         if "camera.azimuth by" in line:  # the first row
             child.kill()
             break
-    child.communicate(timeout=120)
+    child.communicate(timeout=600)
     killed = kept(folder)
     assert killed.ending == "interrupted" and (killed.measured, killed.planned) == (0, 1)
     assert 1 <= len(killed.rows) < len(whole.rows) and values(killed) == values(whole)[: len(killed.rows)]

@@ -59,7 +59,7 @@ write_xml(Path(sys.argv[1]), {"type": "scene", **pictures}, {}, "")
 
 def test_pictures_are_written_in_a_pool_of_one_thread_too(tmp_path: Path) -> None:
     command = [sys.executable, "-c", WRITER, str(tmp_path / "scene.xml")]
-    subprocess.run(command, check=True, timeout=120)
+    subprocess.run(command, check=True, timeout=600)
     values = np.linspace(0, 2, 8 * 16 * 4, dtype=np.float32).reshape(8, 16, 4)
     for path in sorted(tmp_path.glob("*.exr")):
         with OpenEXR.File(str(path)) as file:

@@ -90,6 +90,7 @@ def browser() -> Iterator[Browser]:
 def opened(browser: Browser, address: str, width: int = 1440, **settings: Any) -> Iterator[Page]:
     """An open page; fails where it complains, or asks anybody but the server that it came from."""
     context = browser.new_context(viewport={"width": width, "height": 900}, **settings)
+    context.set_default_timeout(120_000.0)
     page = context.new_page()
     complaints: list[str] = []
     origin = address[: address.index("/", 8)]
@@ -120,7 +121,7 @@ def attack(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def until(page: Page, happened: Callable[[], object]) -> None:
     """Wait until something has happened; the page's policy lets Playwright's own waiting run no code in it."""
-    for _ in range(200):
+    for _ in range(2_000):  # 100 seconds: others may keep the machine busy
         if happened():
             return
         page.wait_for_timeout(50)

@@ -67,7 +67,7 @@ def post(
         **{name.replace("_", "-"): text for name, text in headers.items()},
     }  # fmt: skip
     context = ssl._create_unverified_context() if secure else None
-    made = HTTPSConnection(host, timeout=60, context=context) if secure else HTTPConnection(host, timeout=60)
+    made = HTTPSConnection(host, timeout=600, context=context) if secure else HTTPConnection(host, timeout=600)
     with closing(made):
         made.putrequest("POST", path)
         for name, text in given.items():
@@ -244,7 +244,7 @@ def test_others_send_no_photograph(server: Dashboard, run: Path, headers: dict[s
 
 def ask_as(server: Dashboard, host: str) -> tuple[HTTPResponse, bytes]:
     """The answer to a photograph for another host's name."""
-    made = HTTPConnection("127.0.0.1", server.server_port, timeout=120)
+    made = HTTPConnection("127.0.0.1", server.server_port, timeout=600)
     made.putrequest("POST", PATH, skip_host=True)
     for name, text in (("Host", host), ("Origin", f"http://{host}"), ("X-Advsearch-Key", server.key("first"))):
         made.putheader(name, text)
@@ -284,7 +284,7 @@ def test_renderings_and_photographs_are_shown(server: Dashboard, run: Path) -> N
     post(server, PATH, picture())
     name = sorted((run / "images/photos").glob("*"))[0].name
     for path, found in (("renderings/3", "images/rows/0000/3.jpg"), (f"photos/{name}", f"images/photos/{name}")):
-        made = HTTPConnection("127.0.0.1", server.server_port, timeout=120)
+        made = HTTPConnection("127.0.0.1", server.server_port, timeout=600)
         made.request("GET", f"/runs/first/align/{path}")
         assert made.getresponse().read() == (run / found).read_bytes()
     made.request("GET", "/runs/first/align/")

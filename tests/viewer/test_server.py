@@ -34,7 +34,7 @@ from advsearch.viewer.thumbnails import Kept
 def ask(server: Dashboard, path: str, method: str = "GET", **headers: str) -> tuple[HTTPResponse, bytes]:
     """The answer to one request, whatever the path looks like."""
     made = HTTPConnection if server.scheme == "http" else partial(HTTPSConnection, context=_create_unverified_context())
-    connection = made("127.0.0.1", server.server_port, timeout=120)
+    connection = made("127.0.0.1", server.server_port, timeout=600)
     given = {
         "Host": f"127.0.0.1:{server.server_port}",
         **{name.replace("_", "-"): text for name, text in headers.items()},
@@ -245,7 +245,7 @@ def test_who_waits_when_it_closes_is_hung_up_on(monkeypatch: pytest.MonkeyPatch)
             while served._ready.empty():
                 time.sleep(0.01)
             served.close()
-            asking.settimeout(10.0)
+            asking.settimeout(120.0)
             with suppress(ConnectionResetError):  # what it has said was never read
                 assert asking.recv(1) == b""
             assert served._ready.empty()

@@ -56,7 +56,7 @@ def a_gap() -> Result:
 
 def got(address: str) -> str:
     """What a server answers."""
-    with urlopen(address, timeout=120) as answer:
+    with urlopen(address, timeout=600) as answer:
         return str(answer.read().decode())
 
 

@@ -39,7 +39,7 @@ DRAWS = ("grid", "controls", "samples", "sampler", "seed")  # The settings that 
 OF_THE_SIDE = ("object", "model", "answer")  # What may tell sides apart, as rows have it
 FOLLOWS = (
     *(*DRAWS, "label", "labels", "prompt", "up", "size", "unit", "batch", "keep_pictures", "trials", "verify_spp"),
-    "specialise",
+    *("specialise", "value_range"),
 )
 """Settings that do not tell sweeps apart: of draws, along with object and model, or of no adversarial scene."""
 TOLERANCE = 1e-4  # Of a value, relative to the largest in its column: values come from single precision

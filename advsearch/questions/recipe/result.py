@@ -61,6 +61,7 @@ class RecipeConfig(Config):
     )
     labels: str | None = setting_as_in(SceneConfig, "labels")
     prompt: str | None = setting_as_in(SceneConfig, "prompt")
+    value_range: tuple[float, float] | None = setting_as_in(SceneConfig, "value_range")
     task: str | dict[str, JsonValue] | None = setting_as_in(
         SceneConfig, "task", default=None, otherwise="what the recipe says, or classification"
     )
@@ -81,6 +82,8 @@ class RecipeConfig(Config):
         "recipe", "photographs", "object", "environment", "model", "labels", "task", "run", mode="before"
     )(lambda value, info: SceneConfig._as_text(value, info))
     _prompts = field_validator("prompt", mode="before")(lambda value: SceneConfig._prompts_as_text(value))
+    _range = field_validator("value_range", mode="before")(lambda value: SceneConfig._range_from_text(value))
+    _range_in_order = field_validator("value_range")(lambda value: SceneConfig._range_in_order(value))
     _sized = field_validator("resolution", mode="before")(lambda value: SceneConfig._resolution_from_text(value))
     _sides_in_range = field_validator("resolution")(lambda value: SceneConfig._sides_in_range(value))
     _task = field_validator("task", mode="before")(lambda value: read_joined(value, "task", "classification"))

@@ -313,6 +313,7 @@ def evidence_of(
         "Model": str(values.get("model") or ""),
         "Names of its classes": stated(recorded, "labels"),
         "Prompt": stated(recorded, "prompt"),
+        "Range of its input": stated(recorded, "value_range"),
         "Task": str(values.get("task") or ""),
         "Judged thing": stated(recorded, "judge"),
         "Counts as right": ", ".join(right) if isinstance(right, list) else right,

@@ -56,7 +56,7 @@ LARGEST = 1 << 24  # most bytes of a file, and most numbers of a configuration
 MEMORY = 1 << 27  # bytes that unpacking one may take
 TRIALS = {False: 6, True: 20}  # fresh renders that try one, and one that has to hold under many conditions
 
-OF_MODEL = ("model", "labels", "prompt", "ask", "ensemble")
+OF_MODEL = ("model", "labels", "prompt", "value_range", "ask", "ensemble")
 """Settings that say which network is tested. They go together: all are the suite's where it names a model."""
 
 OF_SUITE = (*PLACE, "threads", "deterministic", "workers", "cluster", "seconds", "log")
