@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, JsonValue, field_validator, model_validator
 
 from advsearch import registry
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 from advsearch.options import JOINED, by_key, things_as_text
 from advsearch.settings import Clash, Config, power, setting, setting_as_in
@@ -78,9 +78,6 @@ SEVERAL = ("object", "environment", "model", "labels", "label", "target", "held_
 TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
 """The settings that are texts, whatever they are given as."""
 ControlsByName = dict[str, dict[str, object]]  # controls as they are asked for: their names, each with its settings
-LARGE = ("car", "person", "stop-sign")  # bundled objects around which lengths were in metres in files of schema 1
-LENGTHS = frozenset({"camera.distance", "camera.height", "camera.focus", "ground.height", "ground.radius", "path"})
-"""What is in metres, and was in object sizes around all others."""
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
 AUTO_SHARE = 2  # with `--spp auto` a search takes the default's samples divided by this
@@ -241,19 +238,6 @@ class SceneConfig(Config):
         if self.size is not None and len(self.objects) > 1:
             raise InputError("size: it is the size of one object, and there are several; leave it out, or give `unit`")
         return self
-
-    def check_older(self, path: str | Path) -> None:
-        given = {**self.controls, **getattr(self, "over", {})}
-        named = {*self.set_, *getattr(self, "grid", {})}
-        named |= {f"{control.get('kind', name)}.{key}" for name, control in given.items() for key in control}
-        if ".csv" in str((given, getattr(self, "path", None))):
-            named.add("path")
-        small = [name for name in self.objects if name not in LARGE and not re.search(r"[./\\#]", name)]
-        if self.size is None and small and (lengths := sorted(named & LENGTHS)):
-            raise FileFormatError(
-                f"{path}: its {lengths[0]} is in sizes of the {small[0]}, which has a size in metres now; write it in "
-                "metres (or as camera.sizes) and `schema: 2`, or keep the numbers with size=1"
-            )
 
     @property
     def title(self) -> tuple[str, ...]:

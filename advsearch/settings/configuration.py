@@ -198,7 +198,6 @@ class Config(BaseModel):
     command: ClassVar[str]
     without: ClassVar[tuple[str, ...]] = ()  # settings of a class above that the command does not have
     clashes: ClassVar[tuple[Clash, ...]] = ()
-    formerly: ClassVar[Mapping[str, str]] = {}  # earlier names of settings, which files and flags may still have
     free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")  # they decide no number: they may change before a run goes on
 
     _only_here: tuple[str, ...] = PrivateAttr(())
@@ -207,7 +206,6 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
     def __init__(self, **data: Any) -> None:
-        data = {self.formerly.get(name, name): value for name, value in data.items()}
         deep = {name: value for name, value in data.items() if not is_shallow(value)}
         if deep:
             raise _settings_error(type(self), [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])
@@ -253,7 +251,7 @@ class Config(BaseModel):
         there. Raises FileFormatError, or InputError as for the class; the message names the file.
         """
         data = {name: value for name, value in written.read_yaml(path).items() if name != "command"}
-        schema = data.pop("schema", written.SCHEMA)
+        data.pop("schema", None)  # checked by `read_yaml`
         for name, value in (overrides or {}).items():
             written.put(data, name, value)
         try:
@@ -263,12 +261,7 @@ class Config(BaseModel):
         except SettingsError as error:
             raise SettingsError(error.problems, path) from None
         made._left_out = tuple(left)
-        if schema == written.OLDEST:
-            made.check_older(path)
         return made
-
-    def check_older(self, path: str | Path) -> None:
-        """Refuse, by a FileFormatError, what a file of an older schema meant otherwise."""
 
     @property
     def powers(self) -> tuple[LeftOut, ...]:
