@@ -488,17 +488,14 @@ FIRST = ("attack", "render", "sweep")  # the commands that the docs show first
 
 class _Configs(Mapping[str, type[Config]]):
     def __iter__(self) -> Iterator[str]:
-        names = sorted(["render", *registry.rooms()], key=lambda name: (name not in FIRST, name))
-        return (name for name in names if name == "render" or registry.part_of(name, "config") is not None)
+        return iter(sorted(registry.EXPERIMENTS, key=lambda name: (name not in FIRST, name)))
 
     def __len__(self) -> int:
-        return sum(1 for _ in self)
+        return len(registry.EXPERIMENTS)
 
     def __getitem__(self, name: str) -> type[Config]:
-        config: type[Config] | None = RenderConfig if name == "render" else registry.part_of(name, "config")
-        if config is None:
-            raise KeyError(name)
-        return config
+        settings: type[Config] = registry.EXPERIMENTS[name].settings
+        return settings
 
 
 CONFIGS: Mapping[str, type[Config]] = _Configs()

@@ -13,7 +13,7 @@ from advsearch.cli.flags import command_in, config_of_file
 from advsearch.cli.main import argument, command
 from advsearch.cli.show import show_run
 from advsearch.errors import InputError
-from advsearch.registry import allow_named
+from advsearch.registry import allow_named, get_experiment
 from advsearch.runs.directory import CONFIG, HOME, find_run, only_here
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.settings import parse_assignment
@@ -58,8 +58,8 @@ def run_file(
             raise InputError(f"{file}: {setting.name}: {setting.does}, which a file can't ask for; type {setting.ask}")
         if not args.quiet:
             print(f"advsearch: {setting.name} is left out: it {setting.does}; type {setting.ask}", file=sys.stderr)
-    question = main.command_named(config.command)
-    return int(question.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
+    command = main.ExperimentCommand(get_experiment(config.command))
+    return command.run_config(config, as_json=args.json, quiet=args.quiet, resumed=resumed)
 
 
 @command(

@@ -207,7 +207,7 @@ class Results:
 
 def taken_rows(asked: Any, results: Results, rows: Iterable[Kept], result: Callable[[list[Kept]], Ending]) -> Ending:
     """Take rows until they end, the time is up or there is an interrupt, and write what they come to after each, into
-    the run of what is `asked` (`question.Asked`).
+    the run of what is `asked` (`experiment.RunContext`).
 
     The summary never has fewer rows than an earlier sitting left in it: those are read back first.
     """

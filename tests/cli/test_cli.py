@@ -26,7 +26,7 @@ from advsearch import __version__
 from advsearch.cli import doctor
 from advsearch.cli import show as names
 from advsearch.cli.flags import with_flags
-from advsearch.cli.main import COMMANDS, help_of, main
+from advsearch.cli.main import get_command_help, list_commands, main
 from advsearch.cli.output import aligned, finish
 from advsearch.cli.output import shown_text as text_of
 from advsearch.controls.base import Choice
@@ -60,12 +60,12 @@ def noting(given: list[Any], answer: Any) -> Api:
 
 @pytest.fixture
 def api(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Put a stand-in in the place of `advsearch.question.carry_out`."""
+    """Put a stand-in in the place of `advsearch.experiment.run_experiment`."""
 
     def not_wanted(config: Config, **named: Any) -> Any:
         raise AssertionError(f"the command line asked for {config.command}")
 
-    return lambda answering=not_wanted: monkeypatch.setattr("advsearch.question.carry_out", answering)
+    return lambda answering=not_wanted: monkeypatch.setattr("advsearch.experiment.run_experiment", answering)
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
         after = resource.getrusage(resource.RUSAGE_CHILDREN)  # CPU seconds: what others do on the machine takes none
         seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     assert (done.returncode, done.stderr) == (0, "[]\n")
-    assert all(name in done.stdout for name in COMMANDS)
+    assert all(name in done.stdout for name in list_commands())
     assert min(seconds) < 0.5
 
 
@@ -115,12 +115,12 @@ def test_help_has_four_groups_and_each_command_once_with_its_whole_help(
     groups = listing.split("\n\n")
     assert [group.partition(": ")[0] for group in groups[1:]] == ["look", "trust", "files and runs"]
     shown = re.findall(r"^  ([a-z0-9-]+) +(.+(?:\n {4,}.*)*)", listing, re.M)
-    assert [name for name, _ in shown] == list(COMMANDS)
+    assert [name for name, _ in shown] == list_commands()
     for name, text in shown:
-        assert " ".join(text.split()) == help_of(name)
+        assert " ".join(text.split()) == get_command_help(name)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", list_commands())
 def test_every_command_has_help_and_json(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
     out, err = capsys.readouterr()
@@ -212,7 +212,7 @@ def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
     code = (
         "import sys, advsearch.question\n"
         "def carry_out(config, *, progress, resumed): raise ValueError('a bug')\n"
-        "advsearch.question.carry_out = carry_out\n"
+        "advsearch.experiment.run_experiment = carry_out\n"
         "from advsearch.cli.main import main; sys.exit(main(['attack', '--object', 'mug', '--json']))"
     )
     path = os.pathsep.join(map(str, (ROOT, ROOT / "tests")))
@@ -276,7 +276,7 @@ sys.meta_path.insert(0, Swallows())
 sys.argv[1:] = ["attack", "--object", "mug", "--json", *sys.argv[1:]]
 import advsearch.question
 from advsearch.cli.main import main
-advsearch.question.carry_out = carry_out
+advsearch.experiment.run_experiment = carry_out
 sys.exit(main())
 """
 

@@ -18,7 +18,7 @@ import advsearch
 from advsearch.engine import problem
 from advsearch.engine import problem as problems
 from advsearch.engine import transport as searching
-from advsearch.question import Asked, carried_out
+from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
 from advsearch.questions.attack.summary import attack_of
@@ -219,7 +219,7 @@ def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.Mo
     monkeypatch.setattr(searching, "predicting", counted)
     settings: Any = {**SMALL, "baseline": False, "average": 0, "resolution": (SIZE, SIZE)}
     config = AttackConfig(object="mug", epsilon="0.002,0.004", run=str(tmp_path / "curve"), **settings)
-    found = carried_out(curve, Asked(config))
+    found = run_and_save(curve, RunContext(config))
     assert made == 1 and [one.robust for one in found.curve] == [1, 1]
     alone = advsearch.attack("mug", epsilon=0.004, run=tmp_path / "alone", **settings)
     shared = attack_of(tmp_path / "curve" / "parts" / found.parts[1])

@@ -19,8 +19,8 @@ from advsearch.engine.record import Stages
 from advsearch.engine.surface_light import LIGHTS, SurfaceLight
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.experiment import RunContext
 from advsearch.options import OUT_OF_VIEW
-from advsearch.question import Asked
 from advsearch.questions.attack.carry_out import LOADING, problem_from_config
 from advsearch.questions.attack.outcome import transport_of
 from advsearch.questions.attack.settings import AttackConfig
@@ -55,7 +55,7 @@ class Varied:
         return u
 
 
-def region_around(asked: Asked[RegionConfig]) -> RegionResult:
+def region_around(asked: RunContext[RegionConfig]) -> RegionResult:
     config, stages = asked.config, Stages(asked.progress)
     stages.begin("setup", LOADING)
     budget: dict[str, object] = {}
