@@ -57,6 +57,14 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
             raise InputError(f"{name}: expected {self.expected}, got {entry!r}")
         return entry
 
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is an entry, which is imported only where the name is that of a class."""
+        if not isinstance(name, str):
+            return False
+        if self.names_class(name):
+            return self[name] is not None
+        return name in self.own or name in self._installed
+
     def __iter__(self) -> Iterator[str]:
         return iter([*self.own, *(name for name in self._installed if name not in self.own)])
 

@@ -14,8 +14,9 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation, Policy
 from advsearch.attacks.evaluation import Query
+from advsearch.engine.acceptance import VIEWS, ComparedView, Deviation
 from advsearch.engine.bank import stratified
-from advsearch.engine.problem import VIEWS, ComparedView, Deviation, Problem
+from advsearch.engine.problem import Problem
 from advsearch.engine.transport import PredictedSearch
 from advsearch.runs.results import BankOfConditions
 from advsearch.scene.formation import to_8_bit

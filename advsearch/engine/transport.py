@@ -19,7 +19,8 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.engine.problem import ComparedView, Deviation, Problem, compared
+from advsearch.engine.acceptance import ComparedView, Deviation, compared
+from advsearch.engine.problem import Problem
 from advsearch.runs.results import BankOfConditions, LinearTransport, PredictionError
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.predictor import NOISE, Predictor

@@ -151,7 +151,7 @@ def test_no_command_prints_help_and_version_is_told(capsys: pytest.CaptureFixtur
         (["atack"], "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, "),
         (["--jsn"], "unknown flag '--jsn'."),
         (["attack", "--epsilom", "1"], "unknown flag '--epsilom'. Did you mean '--epsilon'"),
-        (["attack", "--eps", "1"], "advsearch attack has no --eps; did you mean --epsilon?"),
+        (["attack", "--eps", "1"], "unknown flag '--eps'. Did you mean '--epsilon'?"),
         (["region", "--workers", "2"], "advsearch region has no --workers, a flag of advsearch attack, sweep"),
         (["attack", "mug"], "expected flags, got 'mug'; for the object write --object mug; see advsearch attack -"),
         (["attack", "--steps"], "argument --steps: expected one argument; see advsearch attack --help"),
@@ -210,7 +210,7 @@ def test_a_message_names_the_argument_in_python_and_the_flag_on_the_command_line
 
 def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
     code = (
-        "import sys, advsearch.question\n"
+        "import sys, advsearch.experiment\n"
         "def carry_out(config, *, progress, resumed): raise ValueError('a bug')\n"
         "advsearch.experiment.run_experiment = carry_out\n"
         "from advsearch.cli.main import main; sys.exit(main(['attack', '--object', 'mug', '--json']))"
@@ -241,9 +241,12 @@ def test_what_the_api_raises_becomes_a_status(
 
 
 @pytest.mark.parametrize(("ending", "status"), [("interrupted", 130), ("found", 0), ("budget spent", 0)])
-def test_a_result_of_a_run_that_was_stopped_has_the_status_of_an_interrupt(ending: str, status: int) -> None:
+def test_a_result_of_a_run_that_was_stopped_has_the_status_of_an_interrupt(
+    ending: str, status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     result: Any = types.SimpleNamespace(ending=ending, run=None)
-    assert finish(result, lambda _: "the answer", as_json=False) == status
+    monkeypatch.setattr("advsearch.cli.output.shown_text", lambda result: "the result")
+    assert finish(result, as_json=False) == status
 
 
 SWALLOWING = """
@@ -274,7 +277,7 @@ class Swallows(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 sys.meta_path.insert(0, Swallows())
 sys.argv[1:] = ["attack", "--object", "mug", "--json", *sys.argv[1:]]
-import advsearch.question
+import advsearch.experiment
 from advsearch.cli.main import main
 advsearch.experiment.run_experiment = carry_out
 sys.exit(main())

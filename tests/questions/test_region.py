@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from stand_ins import Impatient, rows
 
-from advsearch.engine import problem
-from advsearch.engine import problem as problems
+from advsearch.engine import acceptance, problem
 from advsearch.questions.region import growing, region
 from advsearch.questions.region.result import RegionConfig, RegionResult
 from advsearch.runs.store import NAME as STORE
@@ -29,8 +28,8 @@ def coarse() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(texels, "GROUND", 32)
         for module, name, value in (
-            (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (problems, "CHECK_SPP", 4),
-            (problems, "BOUND", 50.0), (problems, "MARGIN", 50.0), (growing, "MOST_PROBED", 20),
+            (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (acceptance, "CHECK_SPP", 4),
+            (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (growing, "MOST_PROBED", 20),
             (growing, "pays_from", lambda *_: 1),
         ):  # fmt: skip
             patched.setattr(module, name, value)

@@ -11,8 +11,7 @@ from stand_ins import Impatient, rows
 from torch import Tensor
 
 import advsearch
-from advsearch.engine import problem
-from advsearch.engine import problem as problems
+from advsearch.engine import acceptance, problem
 from advsearch.engine import transport as searching
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.renderer import Renderer
@@ -177,7 +176,7 @@ SEARCH: dict[str, Any] = {
 def test_a_search_over_light_renders_its_basis_and_its_comparisons(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(searching, "EVERY", 8)
     for name in ("BOUND", "MARGIN"):
-        monkeypatch.setattr(problems, name, 50.0)
+        monkeypatch.setattr(acceptance, name, 50.0)
     found = advsearch.attack("mug", run=None, **SEARCH).summary
     told, renders = found.transport, found.renders
     assert told is not None and told.used and told.reason is None and told.entries == 0 and told.bytes

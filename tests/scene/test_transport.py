@@ -15,8 +15,7 @@ from stand_ins import Impatient, rows
 from torch import Tensor
 
 import advsearch
-from advsearch.engine import problem
-from advsearch.engine import problem as problems
+from advsearch.engine import acceptance, problem
 from advsearch.engine import transport as searching
 from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack.settings import AttackConfig
@@ -201,7 +200,7 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(searching, "predicting", counted)
     monkeypatch.setattr(searching.Transport, "likely", guessed)
-    monkeypatch.setattr(problems, "BOUND", 100.0)
+    monkeypatch.setattr(acceptance, "BOUND", 100.0)
     found = advsearch.attack("mug", smallest=True, baseline=False, run=None, **SMALL).summary  # type: ignore[arg-type]
     assert found.smallest is not None and found.smallest.epsilon is not None and found.smallest.searches > 1
     assert made == 1 and guesses >= 5
@@ -245,8 +244,8 @@ def test_a_search_says_what_predicted_its_pictures_and_one_that_goes_on_ends_wit
     """It compares, and makes the matrix anew where that is off. What is read back is not predicted again: the matrix
     was made anew once before the interrupt."""
     monkeypatch.setattr(searching, "EVERY", 6)
-    monkeypatch.setattr(problems, "MARGIN", 0.0)
-    monkeypatch.setattr(problems, "OF_MOVED", 0.0)
+    monkeypatch.setattr(acceptance, "MARGIN", 0.0)
+    monkeypatch.setattr(acceptance, "OF_MOVED", 0.0)
     settings: Any = {**SMALL, "baseline": False, "deterministic": True}
     found = advsearch.attack("mug", run=tmp_path / "whole", **settings)
     told, renders = found.summary.transport, found.summary.renders

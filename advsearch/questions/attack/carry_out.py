@@ -41,10 +41,11 @@ from advsearch.models.address import AskedModel
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.attack import settings as numbers
+from advsearch.questions.attack.ambient import problems_by_name
 from advsearch.questions.attack.outcome import summarise
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.stages import Attack, problems_by_name
+from advsearch.questions.attack.stages import Attack
 from advsearch.report.wording import count
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
 from advsearch.runs.directory import only_here as only_python_has

@@ -16,7 +16,8 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Query
 from advsearch.attacks.domain import Product
-from advsearch.engine.problem import CHECK_SPP, VIEWS, ComparedView, Deviation, Problem, compared, view_of
+from advsearch.engine.acceptance import CHECK_SPP, VIEWS, ComparedView, Deviation, compared, view_of
+from advsearch.engine.problem import Problem
 from advsearch.files import scaled
 from advsearch.questions.sweep.axes import Axis, Points
 from advsearch.runs.results import LinearTransport, PredictionError
