@@ -171,7 +171,7 @@ def test_a_whole_attack_is_told_as_it_is_stored(tmp_path: Path, told: Told, name
         object="mug", controls="pose", policy="random", steps=3, trials=6, verify_spp=16, spp=4, resolution=64,
         denoise="none", baseline=False, log=name, run=str(tmp_path / "run"),
     )  # fmt: skip
-    attack.from_config(config)
+    attack.run(config)
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
         rows = [(row.kind, row.step, row.objective) for row in store.rows()]
     assert [kind for kind, *_ in rows].count("search") > 2
