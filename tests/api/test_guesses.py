@@ -196,7 +196,7 @@ def test_an_objective_that_takes_the_picture_first_is_told(scene: advsearch.Scen
     [
         (["mug"], "expected flags, got 'mug'; for the object write --object mug"),
         (["--eot", "camera"], "has no --eot; did you mean --over?"),
-        (["--num-steps=3"], "unknown flag '--num-steps'. Did you mean '--steps'?"),
+        (["--num-steps=3"], "unknown flag '--num-steps'. Did you mean '--steps'"),
         (["--device", "cuda"], "has no --device (pictures are made on the processor"),
         (["--control", "camra"], "unknown control 'camra'. Did you mean 'camera'?"),
         (["--control", "yaw"], "It is a parameter: write pose.yaw."),

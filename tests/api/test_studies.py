@@ -117,7 +117,7 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     def stopped(config: AttackConfig, *, progress: Any, clean: CleanMatrix | None = None) -> Any:
         if len(asked) == 2:
             raise KeyboardInterrupt
-        return run_experiment(config, progress=progress)
+        return carry_out(config, progress=progress)
 
     monkeypatch.setattr(attacking, "attack_once", stopped)
     with pytest.raises(KeyboardInterrupt):
