@@ -19,6 +19,7 @@ from advsearch.errors import ClusterError
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
+from advsearch.scene.predictor import Refusal
 from advsearch.scene.surface import renderer as surface_renderer
 
 SMALL: dict[str, Any] = {
@@ -54,13 +55,13 @@ def grow(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"EVERY": 6, "UNSEEN": 2, "SURE": -1e9, "FIRST": 3, "GROWTH": 4}.items():
         monkeypatch.setattr(bank, name, value)
     monkeypatch.setattr(acceptance, "CHECK_SPP", 4)
-    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: "matrices are tested")
+    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: Refusal("matrices are tested"))
 
 
 @pytest.fixture(autouse=True)
 def by_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let nothing be predicted by light on surfaces."""
-    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: "matrices are tested")
+    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: Refusal("matrices are tested"))
 
 
 @pytest.fixture

@@ -163,7 +163,7 @@ def test_a_search_for_a_viewpoint_that_renders_says_why(settings: dict[str, Any]
     """In words; nothing is measured."""
     parts = parts_of(AttackConfig(object="mug", **{**CAMERA, **settings}))
     problem, _ = problem_of_parts(parts)
-    against = surface_light.reason_against(
+    against = surface_light.refusal_of_surface_light(
         problem, problem.steps, make_policy(str(settings.get("policy", "auto"))), True
     )
     assert reason in str(against)

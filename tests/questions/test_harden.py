@@ -17,7 +17,7 @@ from advsearch.attacks import make_policy
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.loading import Scene
-from advsearch.engine.surface_light import reason_against
+from advsearch.engine.surface_light import refusal_of_surface_light
 from advsearch.errors import InputError, ModelError
 from advsearch.experiment import Experiment
 from advsearch.models import Model
@@ -155,8 +155,10 @@ def test_a_measurement_over_viewpoints_may_be_predicted() -> None:
     work = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
     name, scene = work.splits["held out"].scene(0)
     problem = problem_of(work.attack(("camera",), name), scene, work.model)
-    against = [reason_against(problem, steps, make_policy("auto"), True) for steps in (config.steps, QUICK["steps"])]
-    assert against == [None, "light on surfaces pays from 32 pictures on"]
+    against = [
+        refusal_of_surface_light(problem, steps, make_policy("auto"), True) for steps in (config.steps, QUICK["steps"])
+    ]
+    assert against[0] is None and str(against[1]) == "light on surfaces pays from 32 pictures on"
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ import pytest
 import advsearch
 from advsearch.attacks import clopper_pearson, make_policy
 from advsearch.cli.main import main
-from advsearch.engine.surface_light import reason_against
+from advsearch.engine.surface_light import refusal_of_surface_light
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.experiment import run_experiment
 from advsearch.questions.attack import studies
@@ -285,7 +285,7 @@ def test_the_recipe_for_viewpoints_searches_predicted_pictures_and_counts_render
     search, drawn = runs["search"], [runs["all"], runs["worst"]]
     assert isinstance(search, AttackConfig) and search.steps is not None
     problem, _ = problem_of_parts(parts_of(search))
-    assert reason_against(problem, search.steps, make_policy(search.policy_name), search.specialise) is None
+    assert refusal_of_surface_light(problem, search.steps, make_policy(search.policy_name), search.specialise) is None
     assert [isinstance(one, SweepConfig) and one.specialise for one in drawn] == [False, False]
 
 

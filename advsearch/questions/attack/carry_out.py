@@ -33,7 +33,7 @@ from advsearch.engine.loading import SCENE, Controls, Scene, framed
 from advsearch.engine.naming import AnyModel, load_models, model_name, several
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
-from advsearch.engine.transport import CleanMatrix, reason_against
+from advsearch.engine.transport import CleanMatrix, refusal_of_matrices
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
@@ -289,7 +289,7 @@ def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
     if problem.conditions is None:
         return config.steps or numbers.STEPS, 1
     usual = numbers.OVER_ONE if problem.conditions.dim == 1 else numbers.OVER_PREDICTED
-    if reason_against(problem, config.steps or usual[0], config.specialise) is not None:  # they are rendered
+    if refusal_of_matrices(problem, config.steps or usual[0], config.specialise) is not None:  # they are rendered
         boxes = all(block.norm == "box" for block in problem.domain.blocks)
         usual = numbers.OVER_NUMBERS if boxes else numbers.OVER_RENDERED
     steps, draws = usual

@@ -37,12 +37,13 @@ from advsearch.engine.judging import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.surface_light import SurfaceLight
-from advsearch.engine.transport import CleanMatrix, PredictedSearch, Transport, reason_against, remark
+from advsearch.engine.transport import CleanMatrix, PredictedSearch, Transport, refusal_of_matrices, remark
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.interrupts import interruptible
 from advsearch.questions.attack.ambient import find_ambient
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.wording import count
+from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
 
@@ -102,7 +103,7 @@ class Attack:
             problem.spp, problem.search_depth = stored["spp"], stored.get("search_depth")
             return
         worth = config.specialise and (config.measure == "full" or problem.steps >= planning.WORTH_BOUNCES)
-        against = surface_light.reason_against(problem, problem.steps, self.policy, config.specialise)
+        against = surface_light.refusal_of_surface_light(problem, problem.steps, self.policy, config.specialise)
         if worth and against is not None:  # else no step will be rendered
             title, most = "finding how many bounces of light the search needs", planning.most_pictures(problem)
             hint = "few samples each; `specialise=false` leaves it out"
@@ -118,7 +119,7 @@ class Attack:
         full = config.measure == "full"
         if config.measure == "no" or not self.policy.uses_gradient:
             return
-        if not full and reason_against(problem, problem.steps, config.specialise) is None:
+        if not full and refusal_of_matrices(problem, problem.steps, config.specialise) is None:
             return  # derivatives will come from what predicts the pictures
         renderer, counted = problem.renderer, not full or config.deterministic
         seed = seeds.stream(problem.seed, "measure")
@@ -230,8 +231,8 @@ class Attack:
     def collect_transport(self) -> None:
         problem, steps, findings = self.problem, self.problem.steps, self.findings
         specialise = self.config.specialise
-        matrix = reason_against(problem, steps, specialise)
-        surface = surface_light.reason_against(problem, steps, self.policy, specialise)
+        matrix = refusal_of_matrices(problem, steps, specialise)
+        surface = surface_light.refusal_of_surface_light(problem, steps, self.policy, specialise)
         if matrix is None and problem.conditions is None:
             self._prepare(Transport(problem, steps, clean=self.clean), "collecting light transport")
             return
@@ -247,8 +248,9 @@ class Attack:
         if matrix is None:
             self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
             return
-        too_short = not findings.surface_refused and not reason_against(problem, 1 << 30, specialise)
-        self._renders_because(matrix if too_short or surface == surface_light.NO_CAMERA else surface)
+        too_short = not findings.surface_refused and refusal_of_matrices(problem, None, specialise) is None
+        is_about_matrices = too_short or surface.cause is RefusalCause.NO_CAMERA
+        self._renders_because(matrix if is_about_matrices else surface)
 
     def _prepare(self, predictor: PredictedSearch, title: str) -> None:
         hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
@@ -258,11 +260,11 @@ class Attack:
             predictor.prepare(self.stages.progress.advance)
         except TransportTooLargeError as error:
             self.findings.transport = None
-            self._renders_because(str(error))
+            self._renders_because(Refusal(str(error), RefusalCause.TOO_LARGE))
 
-    def _renders_because(self, reason: str) -> None:
-        self.findings.rendered_because = reason
-        if text := remark(reason):
+    def _renders_because(self, refusal: Refusal) -> None:
+        self.findings.rendered_because = refusal
+        if text := remark(refusal):
             self.stages.progress.message(text)
 
     def search_all(self) -> None:
