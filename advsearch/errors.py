@@ -47,6 +47,10 @@ class ModelError(AdvsearchError):
     """A model that cannot be loaded, or whose output is not logits of shape (N, classes)."""
 
 
+class CodeNotAllowedError(InputError, ModelError):
+    """Python code, weights or an address that only a file names, and that a person has to allow."""
+
+
 class RunExistsError(InputError):
     """The run directory exists already and `overwrite` was not asked for."""
 

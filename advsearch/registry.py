@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from advsearch.catalog import list_built_ins
-from advsearch.errors import InputError, UnknownNameError
+from advsearch.errors import CodeNotAllowedError, InputError, UnknownNameError
 
 Entry = TypeVar("Entry")
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -187,13 +187,13 @@ def how_to_allow(name: str) -> str:
 
 
 def check_import(name: str) -> None:
-    """Check that "package.module:attribute" may be imported. Raises InputError where nobody but a file names it."""
+    """Check that "package.module:attribute" may be imported. Raises CodeNotAllowedError where nobody but a file names it."""
     if name in _ALLOWED:
         return
     importlib.invalidate_caches()
     spec = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [*sys.path, os.getcwd()])
     where = f" from {spec.origin}" if spec is not None and spec.origin else ""
-    raise InputError(
+    raise CodeNotAllowedError(
         f"a file names {name}, Python code{where} that would be imported and run; read it, and {how_to_allow(name)}"
     )
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, cast
 from advsearch import __version__
 from advsearch.cli import output
 from advsearch.cli.output import BAD_INPUT, INTERRUPTED, OK, at_work, end_output, open_descriptors, screens, shortened
-from advsearch.errors import AdvsearchError, InputError, UnknownNameError
+from advsearch.errors import AdvsearchError, CodeNotAllowedError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
 from advsearch.registry import (
     EXPERIMENTS,
@@ -281,7 +281,7 @@ def _run_and_tell(words: list[str]) -> int:
     except AdvsearchError as error:
         from advsearch.cli.flags import with_flags  # late, so that --help answers at once
 
-        asks_for_flag = isinstance(error, UnknownNameError) or "`code=" in str(error)  # no file may name its own code
+        asks_for_flag = isinstance(error, (UnknownNameError, CodeNotAllowedError))  # no file may name its own code
         in_a_file = words[0] in ("run", "resume") and not asks_for_flag
         text = str(error) if in_a_file else with_flags(str(error))
         print(f"advsearch: error: {shortened(text)}", file=sys.stderr)

@@ -14,7 +14,7 @@ from advsearch.cli.main import argument, command
 from advsearch.cli.show import show_run
 from advsearch.errors import InputError
 from advsearch.registry import allow_named, get_experiment
-from advsearch.runs.directory import CONFIG, HOME, find_run, only_here
+from advsearch.runs.directory import CONFIG, HOME, find_run, read_python_only
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.settings import parse_assignment
 from advsearch.settings.values import put
@@ -86,7 +86,7 @@ def resume(args: argparse.Namespace) -> int:
     if finished(path) and not adds:
         print(f"advsearch: {path} is done already", file=sys.stderr)
         return show_run(str(path), args.json)
-    if only := only_here(path):
+    if only := [part.text for part in read_python_only(path)]:
         raise InputError(
             f"{path}: cannot resume from here: {', '.join(only)} existed only in the Python session of the run; call "
             "the same function with the same arguments again, an attack with `resume=True`"

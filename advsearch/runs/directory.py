@@ -19,7 +19,7 @@ from advsearch.files import open_regular
 from advsearch.runs import files, store, summary
 from advsearch.runs.files import PART, storage_errors, write_bytes, write_text
 from advsearch.runs.trackers import Tracker, check_tracker
-from advsearch.settings import HEADER
+from advsearch.settings import HEADER, PythonOnly
 from advsearch.yaml_text import LARGEST
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ OBJECT_FILE = f"{ARTIFACTS}/object.glb"  # what was attacked, before and after, 
 AOV_FOLDER = "aov"  # of a sweep: the ground truth of each picture, by its number
 PARTS = "parts"  # runs that a study consists of
 
-ONLY_HERE = "only in Python"  # the note of what a run has, in words, that no file and no command can name
+ONLY_HERE = "only in Python"  # the note of parts that no file and no command can name: pairs of role and name
 BEGUN_WITH = "settings"  # the note of what decides the run's numbers, as it was when the run began
 
 CONTENTS = (
@@ -332,13 +332,14 @@ def find_run(run: str | Path, *, checked: bool = True) -> Path:
     raise UnknownNameError("run", str(run), known, "Give a name in runs/ or the path of a run's folder.")
 
 
-def only_here(path: Path) -> list[str]:
-    """Return what a run has, in words, that existed only in the Python session that asked for it."""
+def read_python_only(path: Path) -> list[PythonOnly]:
+    """Return the parts of a run that existed only in the Python session that made it."""
     if not (path / store.NAME).is_file():
         return []
     with store.Store(path / store.NAME, read_only=True) as results:
         noted = results.noted(ONLY_HERE)
-    return [str(one) for one in noted] if isinstance(noted, list) else []
+    pairs = noted if isinstance(noted, list) else []
+    return [PythonOnly(str(pair[0]), str(pair[1])) for pair in pairs if isinstance(pair, list) and len(pair) == 2]
 
 
 def is_run(path: Path) -> bool:

@@ -14,13 +14,11 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.controls.projector import ProjectorControl
-from advsearch.engine.journal import Shared
+from advsearch.engine.journal import ProblemKey, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import Verifier
 
 BRIGHTEST = 1e5  # Lux of direct sun: nothing is tried beyond
-IN_LIGHT = "ambient x "
-"""What the names of problems for workers begin with, before how many times the ambient light they have."""
 HALVED = 2
 """How often the step between the last ambient light in which it holds and the first in which it does not is halved: to
 a factor of 1.19."""
@@ -44,7 +42,7 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
         title = f"trying it in ambient light of {lux:.3g} lux"
         verifier.begin(title, 2 * verifier.count, name="ambient", at_most=True)
         shared = verifier.journal.traced
-        there = Shared(in_light(problem, lux / own), shared.executor, f"{IN_LIGHT}{lux / own!r}")
+        there = Shared(in_light(problem, lux / own), shared.executor, lux / own)
         journal = replace(verifier.journal, traced=there)
         tried[lux] = verify(
             replace(verifier, journal=journal).evaluate_all, problem.domain, u, claim=Ending.FOUND, spp=findings.spp,
@@ -61,10 +59,11 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
         good, bad = (between, bad) if holds(between) else (good, between)
 
 
-def problems_by_name(problem: Problem) -> Callable[[str], Problem]:
-    """Return what gives a worker the problem of a query by its name: that of the run, or the same in other light."""
-    lit = lru_cache(maxsize=2)(partial(in_light, problem))
-    return lambda name: lit(float(name.removeprefix(IN_LIGHT))) if name.startswith(IN_LIGHT) else problem
+def problems_by_key(problem: Problem) -> Callable[[ProblemKey], Problem]:
+    """Return what gives a worker the problem of a query: that of the run, or for a number the same in so many times the
+    ambient light."""
+    brightened = lru_cache(maxsize=2)(partial(in_light, problem))
+    return lambda key: brightened(key) if isinstance(key, float) else problem
 
 
 def in_light(problem: Problem, times: float) -> Problem:
