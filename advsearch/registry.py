@@ -187,7 +187,7 @@ def how_to_allow(name: str) -> str:
 
 
 def check_import(name: str) -> None:
-    """Check that "package.module:attribute" may be imported. Raises CodeNotAllowedError where nobody but a file names it."""
+    """Check that "package.module:attribute" may be imported. Raises CodeNotAllowedError where only a file does."""
     if name in _ALLOWED:
         return
     importlib.invalidate_caches()

@@ -90,7 +90,7 @@ RULES = {
     "maite": Rule({"scene", "models", "tasks", "engine"}, {"torch"}),
     "experiment": Rule({"runs", "report", "viewer", "api", "settings"}, {"pydantic"}, HEAVY),
     "questions": Rule(None, None, frozenset(RENDERER)),
-    "testing": Rule({"questions", "engine", "config"}, set()),
+    "testing": Rule({"questions", "engine", "config", "settings"}, set()),
     "api": Rule(None),
     "cli": Rule(None),
     "": Rule(
