@@ -186,7 +186,7 @@ def test_a_camera_that_was_drawn_is_no_progress_of_the_search(monkeypatch: pytes
         before.append(given[-1])
         return ComparedView(8.0, 9.0, 0.0, 3)
 
-    monkeypatch.setattr(acceptance, "view_of", view_of)
+    monkeypatch.setattr("advsearch.engine.problem.view_of", view_of)
     light = SurfaceLight(problem, 40)
     light.prepare()
     assert before == [None] * acceptance.FIRST
