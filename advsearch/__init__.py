@@ -13,7 +13,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from advsearch.registry import made_question, made_questions
+from advsearch.catalog import list_built_ins
+from advsearch.registry import EXPERIMENTS, get_experiment
 
 __version__ = "0.1.0"
 
@@ -32,21 +33,20 @@ _HOMES = {
     "load_scene": "advsearch.engine.loading",
     "measured_palette": "advsearch.api.chart",
     "photo_agreement": "advsearch.questions.photographs.carry_out",
-    "render": "advsearch.api.render",
 }
-"""The public names, and the module of each; besides, every question that
-`advsearch.question` makes."""
+"""The public names, and the module of each. Every experiment is public too."""
 _MODULES = ("controls", "losses", "maite", "testing")  # public modules
-__all__ = [*_HOMES, *_MODULES, *made_questions()]
+__all__ = sorted({*_HOMES, *_MODULES, *list_built_ins("experiment")})
 
 
 def __getattr__(name: str) -> Any:
     """Import the interface on first use (PEP 562)."""
-    if name in __all__:
+    if name in _MODULES or name in _HOMES:
         import_module("advsearch.api")  # sets the threads before torch is imported
-        if name in made_questions():
-            return made_question(name).python
         return import_module(f"advsearch.{name}") if name in _MODULES else getattr(import_module(_HOMES[name]), name)
+    if name.isidentifier() and not name.startswith("_") and name in EXPERIMENTS:
+        import_module("advsearch.api")
+        return get_experiment(name).python
     if name == "plan":
         raise AttributeError("`plan` is a part of `check` now: use advsearch.check(..., loss='model')")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

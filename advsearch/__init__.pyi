@@ -34,6 +34,7 @@ from advsearch.questions.stability.result import StabilityResult
 from advsearch.questions.sweep.carry_out import AnyScene
 from advsearch.questions.sweep.result import SweepResult as SweepResult
 from advsearch.questions.sweep.tracks import Step
+from advsearch.questions.test.result import SuiteResult
 from advsearch.registry import allow_code as allow_code
 from advsearch.tasks import AnyTask
 from advsearch.tasks.base import Task as Task
@@ -500,3 +501,26 @@ def sweep(
     workers: int | None = ...,
     cluster: str | Path | None = ...,
 ) -> SweepResult: ...
+
+def test(
+    suite: str | Path,
+    *,
+    progress: Watched = ...,
+    only: str | Path | None = ...,
+    add: str | Path | None = ...,
+    update: bool = ...,
+    all: bool = ...,
+    fresh: bool = ...,
+    seconds: float | None = ...,
+    model: Path | Names | None = ...,
+    junit: str | Path | None = ...,
+    sarif: str | Path | None = ...,
+    markdown: str | Path | None = ...,
+    seed: int | None = ...,
+    threads: int | None = ...,
+    deterministic: bool = ...,
+    workers: int | None = ...,
+    cluster: str | Path | None = ...,
+    run: str | Path | None = ...,
+    overwrite: bool = ...,
+) -> SuiteResult: ...

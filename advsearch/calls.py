@@ -13,41 +13,8 @@ from advsearch.errors import InputError, resembling
 from advsearch.files import either
 from advsearch.options import told
 
-SYNONYMS = {
-    "objective": "loss loss_fn loss_function criterion objective_fn objective_function",
-    "policy": "lr learning_rate step_size alpha optimizer optimiser method algorithm attack strategy momentum restarts",
-    "epsilon": "eps budget radius",
-    "steps": "iterations iters n_iter num_iter max_iter num_steps n_steps epochs max_evals n_trials",
-    "progress": "verbose verbosity tqdm show_progress disable_tqdm",
-    "batch": "batch_size",
-    "samples": "n_samples num_samples",
-    "resolution": "size image_size img_size width height shape",
-    "run": "out output output_dir folder path_out save save_dir logdir log_dir name",
-    "model": "net network classifier detector models",
-    "scene": "object mesh scenes",
-    "object": "scene mesh",
-    "environment": "background envmap hdri lighting",
-    "labels": "classes class_names",
-    "label": "truth y true_label ground_truth",
-    "target": "targeted y_target target_label target_class",
-    "over": "eot transforms transformations expectation conditions",
-    "workers": "n_jobs jobs num_workers processes",
-    "seed": "random_state random_seed rng",
-    "spp": "samples_per_pixel num_spp",
-    "threads": "num_threads n_threads",
-    "overwrite": "force exist_ok",
-    "controls": "params parameters space control search_space",
-    "metrics": "metric callbacks callback",
-    "seconds": "timeout time_limit time max_time",
-    "minimise": "minimize",
-    "settings": "set",
-    "adversarial_of": "answer_of",
-    "attack": "answer",
-    "set": "settings",
-    "denoise": "denoiser",
-    "input_size": "size image_size img_size resolution",
-}
-"""Keywords of Python's functions, and what else they are called elsewhere."""
+OTHER_TERMS = {"eot": "over", "minimal_perturbation": "smallest"}
+"""Terms of the literature for settings that are called otherwise here."""
 DEVICES = ("device", "cuda", "gpu", "use_cuda")
 
 NOWHERE = {
@@ -79,9 +46,9 @@ def unexpected(function: str, given: Mapping[str, object], known: Sequence[str])
 
 
 def meant_by(name: str, known: Sequence[str]) -> tuple[list[str], str]:
-    """Return which of the known keywords other libraries call so, and why there is none like it here."""
-    meant = [ours for ours, others in SYNONYMS.items() if ours in known and name.lower() in others.split()]
-    return meant, NOWHERE.get(name.lower(), "")
+    """Return the known keywords that the literature calls so, and why there is none like it here."""
+    meant = OTHER_TERMS.get(name.lower())
+    return [meant] if meant in known else [], NOWHERE.get(name.lower(), "")
 
 
 def check_types(parameters: Mapping[str, inspect.Parameter], given: Mapping[str, object]) -> None:

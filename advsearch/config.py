@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field, JsonValue, field_validator, model_validator
 
 from advsearch import registry
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 from advsearch.options import JOINED, by_key, things_as_text
 from advsearch.settings import Clash, Config, power, setting, setting_as_in
@@ -78,9 +78,6 @@ SEVERAL = ("object", "environment", "model", "labels", "label", "target", "held_
 TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
 """The settings that are texts, whatever they are given as."""
 ControlsByName = dict[str, dict[str, object]]  # controls as they are asked for: their names, each with its settings
-LARGE = ("car", "person", "stop-sign")  # bundled objects around which lengths were in metres in files of schema 1
-LENGTHS = frozenset({"camera.distance", "camera.height", "camera.focus", "ground.height", "ground.radius", "path"})
-"""What is in metres, and was in object sizes around all others."""
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
 AUTO_SHARE = 2  # with `--spp auto` a search takes the default's samples divided by this
@@ -245,19 +242,6 @@ class SceneConfig(Config):
         if self.size is not None and len(self.objects) > 1:
             raise InputError("size: it is the size of one object, and there are several; leave it out, or give `unit`")
         return self
-
-    def check_older(self, path: str | Path) -> None:
-        given = {**self.controls, **getattr(self, "over", {})}
-        named = {*self.set_, *getattr(self, "grid", {})}
-        named |= {f"{control.get('kind', name)}.{key}" for name, control in given.items() for key in control}
-        if ".csv" in str((given, getattr(self, "path", None))):
-            named.add("path")
-        small = [name for name in self.objects if name not in LARGE and not re.search(r"[./\\#]", name)]
-        if self.size is None and small and (lengths := sorted(named & LENGTHS)):
-            raise FileFormatError(
-                f"{path}: its {lengths[0]} is in sizes of the {small[0]}, which has a size in metres now; write it in "
-                "metres (or as camera.sizes) and `schema: 2`, or keep the numbers with size=1"
-            )
 
     @property
     def title(self) -> tuple[str, ...]:
@@ -520,17 +504,14 @@ FIRST = ("attack", "render", "sweep")  # the commands that the docs show first
 
 class _Configs(Mapping[str, type[Config]]):
     def __iter__(self) -> Iterator[str]:
-        names = sorted(["render", *registry.rooms()], key=lambda name: (name not in FIRST, name))
-        return (name for name in names if name == "render" or registry.part_of(name, "config") is not None)
+        return iter(sorted(registry.EXPERIMENTS, key=lambda name: (name not in FIRST, name)))
 
     def __len__(self) -> int:
-        return sum(1 for _ in self)
+        return len(registry.EXPERIMENTS)
 
     def __getitem__(self, name: str) -> type[Config]:
-        config: type[Config] | None = RenderConfig if name == "render" else registry.part_of(name, "config")
-        if config is None:
-            raise KeyError(name)
-        return config
+        settings: type[Config] = registry.EXPERIMENTS[name].settings
+        return settings
 
 
 CONFIGS: Mapping[str, type[Config]] = _Configs()

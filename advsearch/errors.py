@@ -12,24 +12,10 @@ import difflib
 import re
 from collections.abc import Iterable, Sequence
 
-SIMILAR, SIMILAR_WORD = 0.6, 0.75  # least ratio of `difflib` at which a name, or a word of it, is spelled nearly alike
+FELL_SHORT = 3
+"""Exit status of a command whose check fell short."""
 
-ELSEWHERE = {
-    "pgd": "fgsm bim ifgsm mifgsm mi-fgsm apgd autoattack",
-    "cmaes": "cma cma-es",
-    "cross_entropy": "ce xent nll crossentropy",
-    "margin": "cw carlini_wagner carlini-wagner",
-    "pose": "rotation orientation transform",
-    "camera": "view viewpoint",
-    "material": "colour color roughness bsdf",
-    "light": "lighting lamp",
-    "environment": "hdri envmap",
-    "haze": "fog weather",
-    "occlusion": "occluder",
-    "car": "sedan vehicle",
-    "person": "pedestrian human",
-}
-"""Names here, and what others call nearly the same."""
+SIMILAR, SIMILAR_WORD = 0.6, 0.75  # least ratio of `difflib` at which a name, or a word of it, is spelled nearly alike
 
 
 class AdvsearchError(Exception):
@@ -46,8 +32,7 @@ class UnknownNameError(InputError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
         names = sorted(known)
-        near = [candidate for candidate in names if name.casefold() in ELSEWHERE.get(candidate, "").split()]
-        near = near or resembling(name, names)[:3]
+        near = resembling(name, names)[:3]
         guess = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
         listed, more = ", ".join(names) or "none", f" {hint}" if hint else ""
         super().__init__(f"unknown {kind} {name!r}.{guess} Known: {listed}.{more}")
@@ -60,6 +45,10 @@ class FileFormatError(InputError):
 
 class ModelError(AdvsearchError):
     """A model that cannot be loaded, or whose output is not logits of shape (N, classes)."""
+
+
+class CodeNotAllowedError(InputError, ModelError):
+    """Python code, weights or an address that only a file names, and that a person has to allow."""
 
 
 class RunExistsError(InputError):

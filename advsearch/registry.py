@@ -13,15 +13,15 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache, cached_property, wraps
+from functools import cached_property, wraps
 from importlib import import_module
 from importlib.machinery import PathFinder
 from importlib.metadata import entry_points
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from advsearch.errors import InputError
+from advsearch.catalog import list_built_ins
+from advsearch.errors import CodeNotAllowedError, InputError, UnknownNameError
 
 Entry = TypeVar("Entry")
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -56,6 +56,14 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         if not self.fits(getattr(entry, "kind", ""), entry):
             raise InputError(f"{name}: expected {self.expected}, got {entry!r}")
         return entry
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is an entry, which is imported only where the name is that of a class."""
+        if not isinstance(name, str):
+            return False
+        if self.names_class(name):
+            return self[name] is not None
+        return name in self.own or name in self._installed
 
     def __iter__(self) -> Iterator[str]:
         return iter([*self.own, *(name for name in self._installed if name not in self.own)])
@@ -179,13 +187,13 @@ def how_to_allow(name: str) -> str:
 
 
 def check_import(name: str) -> None:
-    """Check that "package.module:attribute" may be imported. Raises InputError where nobody but a file names it."""
+    """Check that "package.module:attribute" may be imported. Raises CodeNotAllowedError where only a file does."""
     if name in _ALLOWED:
         return
     importlib.invalidate_caches()
     spec = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [*sys.path, os.getcwd()])
     where = f" from {spec.origin}" if spec is not None and spec.origin else ""
-    raise InputError(
+    raise CodeNotAllowedError(
         f"a file names {name}, Python code{where} that would be imported and run; read it, and {how_to_allow(name)}"
     )
 
@@ -210,69 +218,26 @@ def current_directory_importable() -> Iterator[None]:
             sys.path.remove(directory)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Questions, found by the name of their command: `advsearch/questions/NAME.py`, or a folder `NAME/` where it is large.
-#
-# What is below them (the list of settings, of results, of pages) asks here, by name, so that it imports none of them. A
-# question is an object of its own name, which `advsearch.question.question` has made; beside it may stand `shown`,
-# `claims` and `page`. An older form is a folder that is the command (`COMMAND`) and has `settings.CONFIG`,
-# `carry_out.NAME_from_config`, `result.RESULT` and the rest in modules. The tool works without those that are missing.
-
-FOLDER = Path(__file__).parent / "questions"
+EXPERIMENTS: Registry[Any] = Registry(
+    "advsearch.experiments",
+    {name: part.target for name, part in list_built_ins("experiment").items()},
+    "an `advsearch.experiment.Experiment` whose command is the name of the entry point",
+    lambda name, entry: getattr(getattr(entry, "settings", None), "command", None) == name,
+)
+"""Every experiment by the name of its command, imported when it is used."""
 
 
-@cache
-def _texts() -> dict[str, str]:
-    files = {path.stem: path for path in FOLDER.glob("*.py") if path.stem != "__init__"}
-    files |= {path.parent.name: path for path in FOLDER.glob("*/__init__.py")}
-    return {name: files[name].read_text(encoding="utf-8") for name in sorted(files)}
+def get_experiment(name: str) -> Any:
+    """Return an experiment by the name of its command. Raises UnknownNameError: there is none."""
+    if name not in EXPERIMENTS:
+        raise UnknownNameError("command", name, EXPERIMENTS)
+    return EXPERIMENTS[name]
 
 
-def rooms() -> tuple[str, ...]:
-    """Return the names of the questions."""
-    return tuple(_texts())
-
-
-def made_questions() -> tuple[str, ...]:
-    """Return the names of those that `advsearch.question.question` makes."""
-    return tuple(name for name, text in _texts().items() if "\n@question(" in text)
-
-
-def help_of(name: str) -> str:
-    """Return what a question does, in a line: the first of its file, or in the older form `HELP`."""
-    text = _texts()[name]
-    told = re.search(r'^HELP = "(.*)"$', text, re.MULTILINE)
-    first = told[1] if told else text.partition("\n")[0].strip('" ').rstrip(".")
-    return first[:1].lower() + first[1:]
-
-
-def there(module: str) -> bool:
-    """Return whether a module is none of a question that is missing."""
-    parts = module.split(".")
-    return parts[:2] != ["advsearch", "questions"] or parts[2] in rooms()
-
-
-PARTS = {
-    "config": ("settings", "CONFIG"), "result": ("result", "RESULT"), "others": ("result", "BY_FIELD"),
-    "from_config": ("carry_out", "{}_from_config"), "shown": ("result", "shown"), "claims": ("result", "claims"),
-    "page": ("page", "page"),
-}  # fmt: skip
-"""Where an older form has the parts of a question: a module of its folder, and the name there."""
-
-
-def part_of(name: str, part: str) -> Any:
-    """Return a part of a question, which is imported now; None where there is no such question, or it has none: the
-    class of its settings or of its result, `others` of that by a field that they alone have, what carries it out, and
-    what makes of its result what a person is shown, the sentences that it stands for, or a page of its own kind."""
-    if name not in rooms():
-        return None
-    made, (module, what) = made_question(name), PARTS[part]
-    if made and hasattr(made, part):
-        return getattr(made, part)
-    place = f"advsearch.questions.{name}" + ("" if made else f".{module}")
-    return getattr(import_module(place), what.format(name), None) if find_spec(place) is not None else None
-
-
-def made_question(name: str) -> Any:
-    """Return the question of a name that `advsearch.question.question` has made; None of the older form."""
-    return getattr(import_module(f"advsearch.questions.{name}"), name) if name in made_questions() else None
+def get_experiment_help(name: str) -> str:
+    """Return what an experiment does, in a line: of the catalog, or of an installed one the docstring's first line."""
+    built_in = list_built_ins("experiment").get(name)
+    if built_in is not None:
+        return built_in.help
+    summary = (inspect.getdoc(get_experiment(name).function) or "").partition("\n")[0].rstrip(".")
+    return summary[:1].lower() + summary[1:]

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch.questions.test.settings import SuiteConfig, suite_of
 from advsearch.registry import allow_named
+from advsearch.settings import PythonOnly
 
 if TYPE_CHECKING:
     from advsearch.engine.loading import Scene
@@ -172,7 +173,8 @@ def _asserted(
         title = f"assert_{claim['claim']}"
         values = {"title": title, "settings": given, "seed": seed, "confidence": confidence, "claims": {name: said}}
         suite = suite_of(values, title)
-        only_here = [f"the call of {title}", *(f"the model {model_name(m)}" for m in models.values() if exists_here(m))]
+        only_here = [PythonOnly("call", f"of {title}")]
+        only_here += [PythonOnly("model", model_name(model)) for model in models.values() if exists_here(model)]
         config = SuiteConfig(suite=title, run=None if run is None else str(run)).with_only_here(only_here)
         result = test_from_config(config, suite=suite)
     (claimed,) = result.claims

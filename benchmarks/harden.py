@@ -43,7 +43,7 @@ def main() -> int:
         first = {} if "controls" in changes else SETTINGS
         config = HardenConfig(**{**first, **changes, "run": str(args.run)})
     with watched(True) as progress:
-        result = harden.from_config(config, progress=progress, resumed=args.run if there else None)
+        result = harden.run(config, progress=progress, resumed=args.run if there else None)
     before_and_after = shown(result).sections[0]
     print(" | ".join(before_and_after.heads))
     for row in before_and_after.rows:

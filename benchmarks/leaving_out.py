@@ -35,10 +35,11 @@ import torch
 from advsearch import seeds
 from advsearch.controls import CONTROLS, OWN, make_space
 from advsearch.controls.base import Parameter
+from advsearch.engine.acceptance import CHECK_SPP, levels_off
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.loading import as_controls, framed, load_scene, make_renderer
 from advsearch.engine.planning import bounces_of
-from advsearch.engine.problem import CHECK_SPP, Problem, levels_off
+from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig

@@ -116,7 +116,7 @@ def one(scene: str, args: argparse.Namespace) -> bool:
             error=args.error,
             run=f"{folder}/run",
         )
-        report = precision.from_config(config)
+        report = precision.run(config)
     kept = True
     for found in report.recommendations:
         if found.estimator is None or found.quantity == "margin":

@@ -52,8 +52,8 @@ from advsearch import threads
 
 threads.configure()
 
+from advsearch.engine.acceptance import VIEWS, ComparedView, Deviation, compared, view_of  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
-from advsearch.engine.problem import VIEWS, ComparedView, Deviation, compared, view_of  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.questions.attack.carry_out import attack_once  # noqa: E402

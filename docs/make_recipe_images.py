@@ -138,7 +138,7 @@ def done(run: Path) -> RecipeResult | None:
 
 def gone_on(run: Path) -> RecipeResult | None:
     """Return the result of a run that was begun, once it is done."""
-    return recipe.from_config(RecipeConfig.from_yaml(run / CONFIG), resumed=run) if (run / CONFIG).is_file() else None
+    return recipe.run(RecipeConfig.from_yaml(run / CONFIG), resumed=run) if (run / CONFIG).is_file() else None
 
 
 def renew(name: str, run: Path) -> None:

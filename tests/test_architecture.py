@@ -25,6 +25,7 @@ PACKAGE = ROOT / "advsearch"
 RENDERER = {"mitsuba", "drjit", "mitsuba_oidn"}
 COMMON = {
     "calls",
+    "catalog",
     "copies",
     "distributions",
     "described",
@@ -87,9 +88,9 @@ RULES = {
     "rules": Rule({"attacks", "runs"}, {"numpy", "pandas"}, HEAVY),
     "losses": Rule({"attacks", "engine"}, {"torch"}),
     "maite": Rule({"scene", "models", "tasks", "engine"}, {"torch"}),
-    "question": Rule({"runs", "report", "viewer", "api", "settings"}, {"pydantic"}, HEAVY),
+    "experiment": Rule({"runs", "report", "viewer", "api", "settings"}, {"pydantic"}, HEAVY),
     "questions": Rule(None, None, frozenset(RENDERER)),
-    "testing": Rule({"questions", "engine", "config"}, set()),
+    "testing": Rule({"questions", "engine", "config", "settings"}, set()),
     "api": Rule(None),
     "cli": Rule(None),
     "": Rule(
@@ -116,9 +117,7 @@ OPTIONAL = {
 """Packages that only an extra brings, and which: imported inside a function that says what to do where it is not."""
 
 
-OF_A_PROCESS = {
-    f"advsearch.scene.importing.{name}": "pxr" for name in ("usd_layers", "usd_stage", "usd_surface")
-}
+OF_A_PROCESS = {f"advsearch.scene.importing.{name}": "pxr" for name in ("usd_layers", "usd_stage", "usd_surface")}
 """Modules that run in a process of their own, and what only they import, which an extra brings."""
 
 
@@ -152,20 +151,12 @@ def imports(module: str, path: Path) -> frozenset[str]:
 def room(module: str) -> str:
     """The room of one of our modules: the first name below `advsearch`; empty for the package itself.
 
-    `python -m advsearch` is the command line's front door, so `__main__` belongs to its room; so does the package of
-    a question of the older form, which is its command.
+    `python -m advsearch` is the command line's front door, so `__main__` belongs to its room.
     """
     name = module.split(".")[1] if "." in module else ""
-    if name == "__main__" or (name == "questions" and module.count(".") == 2 and is_command(module)):
+    if name == "__main__":
         return "cli"
     return name if (PACKAGE / name).is_dir() or (PACKAGE / f"{name}.py").is_file() else ""
-
-
-@cache
-def is_command(module: str) -> bool:
-    """Whether a package of a question imports the command line."""
-    path = ROOT.joinpath(*module.split("."), "__init__.py")
-    return path.is_file() and any(name.startswith("advsearch.cli") for name in imports(module, path))
 
 
 def broken_rules() -> Iterator[str]:
@@ -360,7 +351,8 @@ SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
         "from advsearch.cli.main import main\n"
         "with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit): main(['--help'])\n"
         "assert 'attack' in text.getvalue()",
-        "from advsearch.registry import part_of, rooms\nassert [part_of(name, 'result') for name in rooms()]",
+        "from advsearch.registry import EXPERIMENTS, get_experiment\n"
+        "assert [get_experiment(name).result for name in EXPERIMENTS]",
     ],
     ids=["small modules", "rooms", "help", "questions"],
 )
@@ -402,12 +394,21 @@ NOT_MESSAGES = (
 """Modules that read or write flags themselves, also those of another program, and a style sheet."""
 
 
+DESCRIBING = ("setting", "experiment", "BuiltIn", "PositionalArgument")
+"""Calls whose texts are for the help of the command line."""
+
+
 def texts_of_people(source: str) -> Iterator[tuple[int, str]]:
-    """Every text in a module but docstrings and what describes a setting or a question: the command line's help."""
+    """Every text in a module but docstrings and what describes a setting or an experiment: the command line's help."""
     tree = ast.parse(source)
     apart: set[int] = set()
     for node in ast.walk(tree):
-        helps = isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("setting", "question")
+        helps = isinstance(node, ast.Call) and getattr(node.func, "id", "") in (
+            "setting",
+            "experiment",
+            "BuiltIn",
+            "PositionalArgument",
+        )
         if helps or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
             apart.update(id(inner) for inner in ast.walk(node))
     for node in ast.walk(tree):

@@ -35,9 +35,9 @@ from advsearch.cli.export import WRITERS
 from advsearch.cli.flags import config_from
 from advsearch.cli.main import _parse
 from advsearch.config import CONFIGS, RenderConfig, SceneConfig
+from advsearch.engine.acceptance import compared, view_of
 from advsearch.engine.loading import as_controls
 from advsearch.engine.naming import check_run_settings, given_to
-from advsearch.engine.problem import compared, view_of
 from advsearch.files import MESHES
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.compare import CompareConfig

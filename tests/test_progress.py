@@ -18,7 +18,7 @@ from advsearch.cli.flags import with_flags
 from advsearch.cli.output import shown_text as check_text
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
-from advsearch.question import carry_out as answered
+from advsearch.experiment import run_experiment as answered
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check import check
 from advsearch.questions.check.result import CheckConfig
@@ -206,7 +206,7 @@ def test_every_command_says_what_it_does_and_how_far_it_is(tmp_path: Path, confi
 def test_a_check_counts_what_it_says(tmp_path: Path) -> None:
     progress = Recorded()
     asked = {"controls": {"environment.rotation": {}}, "loss": "model", "run": str(tmp_path / "run")}
-    whole = check.from_config(CheckConfig(**SMALL, **asked), progress=progress)
+    whole = check.run(CheckConfig(**SMALL, **asked), progress=progress)
     progress.check()
     assert whole.ending == "done" and whole.gains and len(progress.messages) == len(whole.rows)
     assert "How a search gets its derivatives" in check_text(whole)

@@ -26,7 +26,7 @@ from advsearch.attacks import POLICIES, candidates, clopper_pearson, planned_ren
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cli.main import COMMANDS
+from advsearch.cli.main import list_commands
 from advsearch.cli.show import REGISTRIES
 from advsearch.controls import CONTROLS, texture
 from advsearch.files import MESHES
@@ -109,7 +109,7 @@ def absent(name: str, texts: Iterable[str], text: str | None = None) -> Iterator
 def commands() -> Iterator[str]:
     """Every command has a section with an example and its flags; a sentence says which can be quiet."""
     text, quiet = page("command-line.md"), set()
-    for command in COMMANDS:
+    for command in list_commands():
         section = re.search(rf"^## {command}\n(.*?)(?=^## |\Z)", text, re.M | re.S)
         flags = script("make_figures").flags_of(command)
         quiet |= {command} if "--quiet" in flags else set()

@@ -23,7 +23,7 @@ from advsearch.calls import helped
 from advsearch.errors import InputError
 from advsearch.pictures import upright
 from advsearch.report.sheets import MARGIN, blank
-from advsearch.scene.assets import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 
 Floats = npt.NDArray[np.float64]
 COLOURS = np.array(list(itertools.product((0.1, 0.3, 0.5, 0.7, 0.9), repeat=3)))

@@ -26,13 +26,13 @@ from advsearch.models import find_label_set
 from advsearch.models.labels import names_nothing
 from advsearch.options import Value
 from advsearch.progress import Progress
-from advsearch.questions.attack.carry_out import SEARCHED_WITH, parts_in, problem_of_parts
+from advsearch.questions.attack.carry_out import ROLES_IN_SEARCH, parts_in, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, only_here
+from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, read_python_only
 from advsearch.runs.files import placed_by, storage_errors, write_png, write_text
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.scene.assets import Bools
@@ -156,7 +156,7 @@ def _pictures(folder: Path, categories: Categories, every: bool, progress: Progr
         raise InputError(
             f"{folder}: expected a run of {' or '.join(READ)}, or one with such parts, got one of {command}"
         )
-    if needed := [one for one in only_here(folder) if not one.startswith(SEARCHED_WITH)]:
+    if needed := [part.text for part in read_python_only(folder) if part.role not in ROLES_IN_SEARCH]:
         raise InputError(f"{folder}: {', '.join(needed)}: only the Python session that asked has what renders it")
     yield from READ[command](folder, categories, every, progress)
 

@@ -36,7 +36,8 @@ from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
 from advsearch.runs.files import placed_by, read_png, storage_errors, to_8bit, write_bytes, write_png, write_text
 from advsearch.scene.assembly import ON_PICTURE, posed
-from advsearch.scene.assets import Floats, Ints, Mesh, linear_to_srgb
+from advsearch.scene.assets import Floats, Ints, Mesh
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import NO_MAP, OBJECT
 from advsearch.scene.glb import PLAIN, glb
 from advsearch.scene.mitsuba_backend.writing import NAME, SCATTERINGS, write_scene

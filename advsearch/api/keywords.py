@@ -27,7 +27,7 @@ from advsearch.models import Model
 from advsearch.options import told
 from advsearch.progress import watched
 from advsearch.registry import allow_named
-from advsearch.settings import Config, as_python, settings
+from advsearch.settings import Config, PythonOnly, as_python, settings
 
 Names = str | Sequence[str]  # names in a list, or in a text with commas between them
 LOADED = (loading.Scene, Model, nn.Module)  # what a question may be given in place of a name
@@ -171,8 +171,8 @@ def _docstring(text: str, names: Sequence[str], command: str, settings: Sequence
 def configured(config: type[Made], **given: object) -> Made:
     """Return a configuration of settings as Python has them; None is one that was not given."""
     made = config(**{name: value for name, value in given.items() if value is not None})
-    parts = [f"the model {model_name(one)}" for one in loading.all_lent(loading.MODEL) if exists_here(one)]
-    parts += ["the scene"] if any(one.only_here for one in loading.all_lent(loading.SCENE)) else []
+    parts = [PythonOnly("model", model_name(one)) for one in loading.all_lent(loading.MODEL) if exists_here(one)]
+    parts += [PythonOnly("scene")] if any(one.only_here for one in loading.all_lent(loading.SCENE)) else []
     return made.with_only_here(
-        [*parts, *(f"the control {name}" for name in loading.only_here(loading.all_lent(loading.CONTROL)))]
+        [*parts, *(PythonOnly("control", name) for name in loading.only_here(loading.all_lent(loading.CONTROL)))]
     )

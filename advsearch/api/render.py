@@ -117,7 +117,7 @@ load_model = helped(load_model)
 render = names_code(helped(in_turn()(shows_progress(rendering.render))))
 
 
-def render_from_config(config: RenderConfig, *, progress: Progress | None = None) -> RenderResult:
+def render_picture_file(config: RenderConfig, *, progress: Progress | None = None) -> RenderResult:
     """Render what a configuration describes, write the file, and return what is known about it. Raises InputError as
     `render`, or where the file would replace one that is read, StorageError where it could not be written."""
     progress = progress or NullProgress()

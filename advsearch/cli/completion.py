@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from advsearch.cli import output
-from advsearch.cli.main import COMMANDS, add_command, argument, command, without_commands
+from advsearch.cli.main import add_command, argument, command, list_commands, without_commands
 from advsearch.cli.show import REGISTRIES, list_names
 from advsearch.errors import InputError
 
@@ -41,7 +41,7 @@ def completion(args: argparse.Namespace) -> int:
         raise InputError("completion needs the package shtab; install it with: pip install shtab") from error
     parser, commands = without_commands()
     names = {kind: sorted(list_names(kind)) for kind in NAMED.values() if kind in REGISTRIES}
-    for name in COMMANDS:
+    for name in list_commands():
         for action in add_command(commands, name)._actions:
             flag = action.option_strings[-1] if action.option_strings else ""
             named = names.get(NAMED.get(flag, ""))

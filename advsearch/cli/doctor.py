@@ -25,7 +25,7 @@ from pathlib import Path
 from advsearch import __version__, threads
 from advsearch.cli import output
 from advsearch.cli.main import command
-from advsearch.errors import AdvsearchError
+from advsearch.errors import FELL_SHORT, AdvsearchError
 from advsearch.registry import OWN_FOLDER
 from advsearch.scene.mitsuba_backend import llvm
 
@@ -65,7 +65,7 @@ def doctor(args: argparse.Namespace) -> int:
     good = all(part.status in (OK, WARNING) for part in parts)
     if args.json:
         output.print_json({"schema": 1, "command": "doctor", "ok": good, "parts": [asdict(part) for part in parts]})
-        return 0 if good else output.FELL_SHORT
+        return 0 if good else FELL_SHORT
     # late: what is missing is told without it, too
     from rich.console import Console
     from rich.markup import escape
@@ -82,7 +82,7 @@ def doctor(args: argparse.Namespace) -> int:
     for part in (part for part in parts if part.fix):
         console.print(f"{escape(part.name)}: {escape(part.fix)}", soft_wrap=True)
     console.print("Everything that is necessary works." if good else "[red]Something necessary does not work.[/]")
-    return 0 if good else output.FELL_SHORT
+    return 0 if good else FELL_SHORT
 
 
 def diagnose() -> list[Component]:

@@ -58,8 +58,6 @@ def add_settings(
         if setting.form != "switch":
             options = {"action": "store" if setting.form == "text" else "append", "metavar": setting.metavar}
         add(setting.flag, dest=setting.field, help=help_text(setting), **options)
-        for old in (old for old, new in config.formerly.items() if new == setting.field):
-            add(f"--{old.replace('_', '-')}", dest=setting.field, help=argparse.SUPPRESS)
 
 
 def config_from(args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any) -> AnyConfig:

@@ -11,29 +11,35 @@ import shutil
 import signal
 import sys
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import methodcaller
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from advsearch import __version__
 from advsearch.cli import output
 from advsearch.cli.output import BAD_INPUT, INTERRUPTED, OK, at_work, end_output, open_descriptors, screens, shortened
-from advsearch.errors import AdvsearchError, InputError, UnknownNameError
+from advsearch.errors import AdvsearchError, CodeNotAllowedError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
-from advsearch.registry import allow_code, imported, made_question, made_questions, nothing_allowed, rooms
-from advsearch.registry import help_of as help_of_question
+from advsearch.registry import (
+    EXPERIMENTS,
+    allow_code,
+    get_experiment,
+    get_experiment_help,
+    imported,
+    nothing_allowed,
+)
 
 if TYPE_CHECKING:
+    from advsearch.experiment import Experiment
     from advsearch.settings import Config
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The commands: what the help lists, and what carries each out.
 #
-# A question's command is made of it (`advsearch.question.question`), or a module with `HELP` (one line) and a
-# `QuestionCommand` or `PlainCommand` called `COMMAND`. It imports what is heavy inside functions, so that `advsearch
-# --help` answers at once. Others are functions of this package made a `command`, imported when they are asked for.
+# An experiment's command is made from it (`advsearch.experiment.Experiment`). Others are functions of this package made
+# a `command`, imported when they are used, so that `advsearch --help` answers at once.
 
 Argument = Callable[[argparse.ArgumentParser], object]  # adds something to a parser
 
@@ -45,7 +51,7 @@ def argument(*names: str, **options: Any) -> Argument:
 
 @dataclass(frozen=True)
 class PlainCommand:
-    """A command that asks no question."""
+    """A command that runs no experiment."""
 
     run: Callable[[argparse.Namespace], int]  # does what the arguments say, and returns the exit status
     arguments: tuple[Argument, ...]  # what adds them, in the order in which the help shows them
@@ -64,94 +70,86 @@ def command(
     return lambda run: PlainCommand(run, arguments, more, examples)
 
 
-class Positional(NamedTuple):
-    """How what a question is about is given without its flag, the fields of `expected`."""
-
-    metavar: str  # what the help calls it
-    missing: str  # what an error says where neither is given
-    more: str = ""  # what the help adds
-    several: bool = False
-
-
 @dataclass(frozen=True)
-class QuestionCommand:
-    """A command that asks a question.
+class ExperimentCommand:
+    """The command of an experiment. `--code` allows Python code that the run or file which it is about names."""
 
-    Attributes:
-        name: of the command; `advsearch.config.CONFIGS` has its settings, and `question.carry_out` asks with them.
-        text: makes a text for a person of its result; what is shown of it where it has no other.
-        short, about, expected, brought, listed, more, examples: as of `advsearch.question.Question`; `--code` allows
-            Python code that the runs, or the file, which it is about name.
-    """
-
-    name: str
-    text: Callable[[Any], str] = output.shown_text
-    short: Callable[[Any], bool] = lambda result: False
-    about: str = ""
-    expected: tuple[Any, ...] | None = None
-    brought: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None
-    listed: str = ""
-    more: str = ""
-    examples: tuple[str, ...] = ()
+    experiment: Experiment[Any]
 
     @property
-    def place(self) -> Positional | None:
-        """How what it is about is given without its flag; None for not at all."""
-        return Positional(*self.expected) if self.expected else None
+    def name(self) -> str:
+        return self.experiment.settings.command
+
+    @property
+    def more(self) -> str:
+        return self.experiment.help_suffix
+
+    @property
+    def examples(self) -> tuple[str, ...]:
+        return self.experiment.examples
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         # late, so that --help answers at once
         from advsearch.cli.flags import add_settings
-        from advsearch.config import CONFIGS
 
-        add_settings(parser, CONFIGS[self.name])
+        add_settings(parser, self.experiment.settings)
         output.add_quiet_flags(parser)
-        if place := self.place:
-            many, text = "*" if place.several else "?", f"as `--{self.about}`{place.more}"
-            parser.add_argument(self.about, metavar=place.metavar, nargs=many, default=argparse.SUPPRESS, help=text)
-        if self.about:
+        about = self.experiment.about
+        if positional := self.experiment.positional:
+            parser.add_argument(
+                about,
+                metavar=positional.metavar,
+                nargs="*" if positional.many else "?",
+                default=argparse.SUPPRESS,
+                help=f"as `--{about}`{positional.more}",
+            )
+        if about:
             output.add_code_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        """Ask what the arguments say. Raises InputError where what it is about is missing."""
-        named, place = getattr(args, self.about, None), self.place
-        if self.listed and named == "list":
-            lines = imported(self.listed)()
+        """Run the experiment that the arguments describe. Raises InputError where what it is about is missing."""
+        about = self.experiment.about
+        subject = getattr(args, about, None)
+        if self.experiment.choices and subject == "list":
+            lines = imported(self.experiment.choices)()
             listed = [{"name": name, "title": text} for name, text in lines.items()]
             return output.say(args.json, {f"{self.name}s": listed}, output.aligned([*lines.items()]))
-        if place and named in (None, []):
+        if self.experiment.positional and subject in (None, []):
             command = f"advsearch {self.name}"
-            raise InputError(f"{command}: expected {place.missing}; see {command} --help")
-        if isinstance(named, list):
-            setattr(args, self.about, ",".join(named))
-        return self.carry_out(self.config(args), as_json=args.json, quiet=args.quiet)
+            raise InputError(f"{command}: expected {self.experiment.positional.expected}; see {command} --help")
+        if isinstance(subject, list):
+            setattr(args, about, ",".join(subject))
+        return self.run_config(self.read_config(args), as_json=args.json, quiet=args.quiet)
 
-    def config(self, args: argparse.Namespace) -> Config:
-        """Return the configuration that the arguments describe, over what the first run that it is about brings."""
+    def read_config(self, args: argparse.Namespace) -> Config:
+        """Return the settings that the arguments describe, over those of the first run that it is about."""
         # late, so that --help answers at once
         from advsearch.cli.flags import config_from
-        from advsearch.config import CONFIGS
         from advsearch.runs.directory import CONFIG, find_run
         from advsearch.settings import settings, split_names
 
-        config, brought = CONFIGS[self.name], dict[str, Any]()
-        if self.brought and self.about in args:
-            name = getattr(args, self.about)
-            name = next(iter(split_names(name)), name) if self.place and self.place.several else name
-            brought = self.brought(find_run(name) / CONFIG, vars(args))
-        elif self.brought and (missing := [s.flag for s in settings(config) if s.required and s.field not in args]):
-            command, run = f"advsearch {self.name}", f"--{self.about.replace('_', '-')} RUN"
-            raise InputError(f"{command}: expected {missing[0]} NAME, or {run}; see {command} --help")
-        return config_from(args, config, **brought)
+        config_type, about = self.experiment.settings, self.experiment.about
+        read_defaults = self.experiment.defaults_from_run
+        if read_defaults is None:
+            return config_from(args, config_type)
+        if about in args:
+            run_name = getattr(args, about)
+            if self.experiment.positional and self.experiment.positional.many:
+                run_name = next(iter(split_names(run_name)), run_name)
+            return config_from(args, config_type, **read_defaults(find_run(run_name) / CONFIG, vars(args)))
+        missing = [one.flag for one in settings(config_type) if one.required and one.field not in args]
+        if missing:
+            command, run_flag = f"advsearch {self.name}", f"--{about.replace('_', '-')} RUN"
+            raise InputError(f"{command}: expected {missing[0]} NAME, or {run_flag}; see {command} --help")
+        return config_from(args, config_type)
 
-    def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-        """Ask what `config` describes, or go on with it; print the result and return the exit status."""
+    def run_config(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
+        """Run the experiment with settings, or continue a run; print the result and return the exit status."""
         with at_work(as_json=as_json, quiet=quiet) as progress:
-            from advsearch.question import carry_out  # late, so that --help answers at once
+            from advsearch import experiment  # late, so that --help answers at once
 
-            result = carry_out(config, progress=progress, resumed=resumed)
-        status = output.finish(result, self.text, as_json=as_json)
-        return status or (output.FELL_SHORT if self.short(result) else 0)
+            result = experiment.run_experiment(config, progress=progress, resumed=resumed)
+        return output.finish(result, as_json=as_json) or self.experiment.exit_status(result)
 
 
 GROUPS = {
@@ -159,11 +157,11 @@ GROUPS = {
         ("attack", "sweep", "gap", "region", "explain", "compare", "recipe", "harden"), ""
     ),
     "look: at scenes, names and predictions": {
-        "render": "show:RENDER render a picture of a scene, and say what the model sees in it",
+        "render": "",
         "show": "show:show show what a run found, or the details of a control, a policy, a task or a recipe",
         "view": "dashboard:view write the page of a run again, or a folder that any web server can serve",
         "dashboard": "dashboard:dashboard show the pages of runs in a browser on this machine",
-        "report": "",
+        "report": "report:report write what runs show, and no more than that, for a model card or a safety case",
         "list": "show:list_all list all names: objects, environments, controls, policies, tasks, objectives, models "
         "and recipes",
         "labels": "show:labels find the names of a model's classes, as --label takes them",
@@ -184,28 +182,40 @@ GROUPS = {
         "import-3db": "imports:threedb turn a folder that 3DB wrote into a run",
     },
 }
-"""Each command, in the groups and the order in which the help shows them: empty for a question, which is found by its
-name; for another command its module in this package, its function there and what it does. A question that `question`
-makes needs no line here: the help shows it behind the others that ask."""
+"""Each command, in the groups and the order of the help: empty for an experiment; for another command its module in
+this package, its function there and what it does."""
 
-for _name in set(made_questions()).difference(*GROUPS.values()):
-    next(iter(GROUPS.values()))[_name] = ""
-
-COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items() if place or name in rooms()}
+COMMANDS_OF_THIS_PACKAGE = {name: target for group in GROUPS.values() for name, target in group.items() if target}
 
 
-def command_named(name: str) -> Any:
-    """Return the `QuestionCommand` or `PlainCommand` of a name."""
-    if COMMANDS[name]:
-        return imported(f"advsearch.cli.{COMMANDS[name].partition(' ')[0]}")
-    if made := made_question(name):
-        same = ("short", "about", "expected", "brought", "listed", "more", "examples")
-        return QuestionCommand(name, **{attribute: getattr(made, attribute) for attribute in same})
-    return imported(f"advsearch.questions.{name}:COMMAND")
+def list_commands() -> list[str]:
+    """Return the names of all commands in the order of the help; experiments of packages follow the built-in ones."""
+    groups = group_commands()
+    return [name for group in groups.values() for name in group]
 
 
-def help_of(name: str) -> str:
-    return COMMANDS[name].partition(" ")[2] or help_of_question(name)
+def group_commands() -> dict[str, list[str]]:
+    """Return the names of the commands by the heading that the help has for them, without those that are missing."""
+    groups = {
+        title: [name for name, target in group.items() if target or name in EXPERIMENTS]
+        for title, group in GROUPS.items()
+    }
+    known = {name for group in groups.values() for name in group}
+    next(iter(groups.values())).extend(name for name in EXPERIMENTS if name not in known)
+    return groups
+
+
+def get_command(name: str) -> ExperimentCommand | PlainCommand:
+    target = COMMANDS_OF_THIS_PACKAGE.get(name)
+    if target is None:
+        return ExperimentCommand(get_experiment(name))
+    command: PlainCommand = imported(f"advsearch.cli.{target.partition(' ')[0]}")
+    return command
+
+
+def get_command_help(name: str) -> str:
+    target = COMMANDS_OF_THIS_PACKAGE.get(name)
+    return get_experiment_help(name) if target is None else target.partition(" ")[2]
 
 
 _EXAMPLES = """examples:
@@ -271,7 +281,7 @@ def _run_and_tell(words: list[str]) -> int:
     except AdvsearchError as error:
         from advsearch.cli.flags import with_flags  # late, so that --help answers at once
 
-        asks_for_flag = isinstance(error, UnknownNameError) or "`code=" in str(error)  # no file may name its own code
+        asks_for_flag = isinstance(error, (UnknownNameError, CodeNotAllowedError))  # no file may name its own code
         in_a_file = words[0] in ("run", "resume") and not asks_for_flag
         text = str(error) if in_a_file else with_flags(str(error))
         print(f"advsearch: error: {shortened(text)}", file=sys.stderr)
@@ -284,19 +294,19 @@ def _run(words: list[str]) -> int:
     name = words[0] if words and not words[0].startswith("-") else None
     if name == "plan":
         raise InputError("`plan` is a part of `check` now: use advsearch check --loss model, with the same flags")
-    if name is not None and name not in COMMANDS:
-        raise UnknownNameError("command", name, COMMANDS, "See advsearch --help.")
+    if name is not None and name not in list_commands():
+        raise UnknownNameError("command", name, list_commands(), "See advsearch --help.")
     try:
         args = _parse(words, name)
     except SystemExit as stop:  # --help and --version have printed their text
         return int(stop.code or 0)
     allow_code(*getattr(args, "code", ()))
-    return int(command_named(args.command).run(args))
+    return int(get_command(args.command).run(args))
 
 
 def _parse(words: list[str], command: str | None) -> argparse.Namespace:
     parser, subparsers = without_commands()
-    for name in COMMANDS:
+    for name in list_commands():
         add_command(subparsers, name, whole=name == command)
     args, unknown = parser.parse_known_args(words)
     if unknown:
@@ -309,11 +319,12 @@ def _parse(words: list[str], command: str | None) -> argparse.Namespace:
 
 def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAction[Any]]:
     """Return the parser, and what `add_command` adds the commands to."""
-    column = 4 + max(map(len, COMMANDS))
+    groups = group_commands()
+    column = 4 + max(len(name) for group in groups.values() for name in group)
     width = max(shutil.get_terminal_size().columns - 2, 2 * column)
     lines = []
-    for title, commands in GROUPS.items():
-        texts = [f"  {name}".ljust(column) + help_of(name) for name in commands if name in COMMANDS]
+    for title, names in groups.items():
+        texts = [f"  {name}".ljust(column) + get_command_help(name) for name in names]
         lines += [title, *(textwrap.fill(text, width, subsequent_indent=" " * column) for text in texts), ""]
     parser = Parser(
         prog="advsearch",
@@ -339,7 +350,7 @@ def add_command(
     """Return the new parser of a command; if not `whole` it has no arguments, and serves the list of commands."""
     if not whole:
         return cast(argparse.ArgumentParser, subparsers.add_parser(name))
-    command, text = command_named(name), help_of(name)
+    command, text = get_command(name), get_command_help(name)
     examples = "".join(f"  advsearch {line}\n" for line in command.examples)
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name,

@@ -13,7 +13,7 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TextIO, cast
@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     from advsearch.runs.results import Result
 
 
-OK, BAD_INPUT, FELL_SHORT, INTERRUPTED = 0, 2, 3, 130
-"""Exit statuses of a command that did its work, was given what it cannot take, is a check that fell short, and was
-interrupted."""
+OK, BAD_INPUT, INTERRUPTED = 0, 2, 130
+"""Exit statuses of a command that did its work, was given what it cannot take, and was interrupted."""
 
 LONGEST_WORD = 300  # most characters of a name in a message; of a longer one the ends are shown
 
@@ -150,13 +149,12 @@ def print_json(value: Any) -> None:
     print(text.replace("\x7f", "\\u007f"))  # JSON escapes all others that a terminal would not show
 
 
-def finish(result: Result, text: Callable[[Any], str], *, as_json: bool) -> int:
-    """Print the last word of a command, as JSON or as the text for a person that `text` makes, and return its exit
-    status."""
+def finish(result: Result, *, as_json: bool) -> int:
+    """Print a result, as JSON or as text for a person, and return the exit status."""
     if as_json:
         print_json(result)
     else:
-        print(text(result) + go_on_text(result))
+        print(shown_text(result) + go_on_text(result))
     stopped = getattr(result, "ending", None) == "interrupted"
     return INTERRUPTED if stopped else OK
 

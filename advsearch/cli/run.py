@@ -13,8 +13,8 @@ from advsearch.cli.flags import command_in, config_of_file
 from advsearch.cli.main import argument, command
 from advsearch.cli.show import show_run
 from advsearch.errors import InputError
-from advsearch.registry import allow_named
-from advsearch.runs.directory import CONFIG, HOME, find_run, only_here
+from advsearch.registry import allow_named, get_experiment
+from advsearch.runs.directory import CONFIG, HOME, find_run, read_python_only
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.settings import parse_assignment
 from advsearch.settings.values import put
@@ -58,8 +58,8 @@ def run_file(
             raise InputError(f"{file}: {setting.name}: {setting.does}, which a file can't ask for; type {setting.ask}")
         if not args.quiet:
             print(f"advsearch: {setting.name} is left out: it {setting.does}; type {setting.ask}", file=sys.stderr)
-    question = main.command_named(config.command)
-    return int(question.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
+    command = main.ExperimentCommand(get_experiment(config.command))
+    return command.run_config(config, as_json=args.json, quiet=args.quiet, resumed=resumed)
 
 
 @command(
@@ -86,7 +86,7 @@ def resume(args: argparse.Namespace) -> int:
     if finished(path) and not adds:
         print(f"advsearch: {path} is done already", file=sys.stderr)
         return show_run(str(path), args.json)
-    if only := only_here(path):
+    if only := [part.text for part in read_python_only(path)]:
         raise InputError(
             f"{path}: cannot resume from here: {', '.join(only)} existed only in the Python session of the run; call "
             "the same function with the same arguments again, an attack with `resume=True`"

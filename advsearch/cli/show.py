@@ -13,18 +13,19 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advsearch.cli import main, output
+from advsearch.catalog import is_present
+from advsearch.cli import output
 from advsearch.cli.flags import add_settings
-from advsearch.cli.main import QuestionCommand, argument, command
+from advsearch.cli.main import argument, command
 from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
-from advsearch.registry import allow_named, imported, there
-from advsearch.report.wording import SEEN, count, interval_text, seen_cells, seen_text, things_rows
+from advsearch.registry import allow_named, imported
+from advsearch.report.wording import count, interval_text
 from advsearch.runs.directory import IMAGES, find_run
 from advsearch.runs.listing import Listed, listed_run
-from advsearch.runs.results import RenderResult, plain
+from advsearch.runs.results import plain
 from advsearch.runs.summary import NAME, read_result
 
 if TYPE_CHECKING:
@@ -77,12 +78,11 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     if not (path / NAME).is_file():
         return _show_unfinished(listed_run(path), as_json)
     result = read_result(path)
-    text = main.command_named(result.command).text
     photos = photos_of(path)
     if as_json:
         output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)
     else:
-        print(text(result) + output.go_on_text(result))
+        print(output.shown_text(result) + output.go_on_text(result))
     if photos and photos.interval is not None and not as_json:
         agreeing, total = photos.right_right + photos.wrong_wrong, count(photos.photos, "photograph")
         sure = f"95 % interval {interval_text(photos.interval)}"
@@ -239,35 +239,6 @@ def _drawing() -> tuple[Callable[[Path], None] | None, str]:
     return lambda file: console.print(renderable.Image(file, height=HEIGHT)), ""
 
 
-def render_text(result: RenderResult) -> str:
-    height, width = result.size
-    lines = [f"{result.out}: {width} x {height} pixels"]
-    lines += [f"{result.answered}: with the predictions drawn in"] if result.answered else []
-    lines += [""]
-    if len(result.views) == 1:
-        rows = [seen_cells(result.task, answer) for answer in result.views[0].answers]
-        lines += [f"Model {result.model} sees", output.aligned(rows)]
-        if (things := result.views[0].things) is not None:
-            rows = things_rows({name: vars(thing) for name, thing in things.items()})
-            lines += ["", "In the picture", output.aligned([["", *SEEN], *rows])]
-        return "\n".join(lines)
-    rows = [["azimuth", f"model {result.model} sees"]]
-    for view in result.views:
-        rows.append([f"{view.azimuth:g}", "; ".join(seen_text(result.task, answer) for answer in view.answers)])
-    return "\n".join([*lines, output.aligned(rows)])
-
-
-RENDER = QuestionCommand(
-    "render",
-    render_text,
-    examples=(
-        "render --object mug --environment kitchen --out mug.png",
-        "render --object mug.obj --environment room.hdr --out around.png --around 8",
-        "render --object mug --control 'pose={yaw: 30}' --set camera.elevation=50 --out mug.exr",
-    ),
-)
-
-
 # ---- names -----------------------------------------------------------------------------------------------------------
 
 
@@ -284,7 +255,7 @@ _EVERY = {
     "recipes": "advsearch.questions.recipe.description:titles",
     CASES: "advsearch.questions.stability.scenes:sentences",
 }
-REGISTRIES = {kind: place for kind, place in _EVERY.items() if there(place)}
+REGISTRIES = {kind: target for kind, target in _EVERY.items() if is_present(target.partition(":")[0])}
 """Where the names of each kind are: a mapping from them, or a function that returns them."""
 
 MODELS = {"reference": "the bundled classifier of household objects; models of your own are given as files"}

@@ -18,7 +18,7 @@ from torch import Tensor
 from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named, number
 from advsearch.controls.ranges import Fixed, Number
 from advsearch.errors import InputError
-from advsearch.scene.assets import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.grounds import on_its_ground
 from advsearch.scene.settings import CHANNELS

@@ -31,7 +31,7 @@ from advsearch.distributions import as_setting
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import Value as Value
 from advsearch.options import rounded
-from advsearch.scene.assets import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription, check_one_environment
 from advsearch.scene.gradients import WHOLE_RANGE as WHOLE_RANGE
 from advsearch.scene.gradients import Budget as Budget

@@ -24,7 +24,8 @@ from advsearch.controls.base import Control, Parameter, Value, Values, measure, 
 from advsearch.controls.ranges import Fixed, OneOf, Range, Spec
 from advsearch.controls.shadow import polygon
 from advsearch.errors import InputError
-from advsearch.scene.assets import Doubles, Ints, Material, Mesh, ObjectAsset, srgb_to_linear
+from advsearch.scene.assets import Doubles, Ints, Material, Mesh, ObjectAsset
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import object_to_world
 from advsearch.scene.parts import MeshPart

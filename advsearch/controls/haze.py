@@ -15,7 +15,7 @@ from torch import Tensor
 
 from advsearch.controls.base import Control, Parameter, Values, color_of, number
 from advsearch.controls.ranges import Number, Range
-from advsearch.scene.assets import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.parts import HazePart

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Control, Parameter, Values, number
 from advsearch.controls.ranges import OneOf
-from advsearch.scene.assets import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.settings import CHANNELS
 
 DOTS = 4  # how many dots there are when nothing is said

@@ -21,7 +21,8 @@ from torch import Tensor
 from advsearch.controls.base import Control, Parameter, Values, color_of, named
 from advsearch.controls.ranges import Number
 from advsearch.errors import InputError
-from advsearch.scene.assets import Doubles, Floats, Material, Mesh, linear_to_srgb, srgb_to_linear
+from advsearch.scene.assets import Doubles, Floats, Material, Mesh
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.raster import looked_up, rasterised
 from advsearch.scene.settings import CHANNELS, MATERIAL, colors

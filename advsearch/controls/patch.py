@@ -31,7 +31,8 @@ from advsearch.controls.corruption_filters import picture, planes, resized
 from advsearch.controls.ranges import Fixed, OneOf, Range, Slot, Spec
 from advsearch.controls.texture import radius, resampled
 from advsearch.errors import FileFormatError, InputError
-from advsearch.scene.assets import Doubles, Mesh, linear_to_srgb, srgb_to_linear
+from advsearch.scene.assets import Doubles, Mesh
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.gradients import WHOLE_RANGE, Budget

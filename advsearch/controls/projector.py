@@ -29,7 +29,7 @@ from advsearch.controls.patch import PRINT_SIDE, PictureControl, enlarged
 from advsearch.controls.ranges import Fixed, Range
 from advsearch.controls.texture import NORMS, radius
 from advsearch.errors import InputError
-from advsearch.scene.assets import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import METERED_WHITE, WHITE, metered_gain, to_8_bit
 from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middle

@@ -25,7 +25,7 @@ from torch import Tensor
 from advsearch.controls.base import Choice, Control, Values, number
 from advsearch.controls.corruption import coded
 from advsearch.controls.corruption_filters import drawn, picture, planes, warped
-from advsearch.scene.assets import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 
 _DARK = 1e-6  # keeps the slope of a square root finite in black
 

@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Choice, Control, Values, number
-from advsearch.scene.assets import EnvironmentAsset, srgb_to_linear
+from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.mitsuba_backend.parts import sunsky_tables
 from advsearch.scene.settings import LIT

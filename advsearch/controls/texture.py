@@ -23,7 +23,8 @@ from torch import Tensor
 from advsearch.controls.base import LARGEST_EPSILON, NOTHING, Choice, Control, Parameter, Value, changed
 from advsearch.controls.corruption_filters import resized
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Bools, Floats, srgb_to_linear
+from advsearch.scene.assets import Bools, Floats
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.gradients import Budget, Group
 from advsearch.scene.parts import MeshPart

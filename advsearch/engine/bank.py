@@ -17,7 +17,7 @@ from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.domain import Domain, Draws
 from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.policies.sampling import to_domain
-from advsearch.engine.problem import ComparedView
+from advsearch.engine.acceptance import ComparedView
 from advsearch.engine.transport import PredictedSearch
 from advsearch.files import scaled
 from advsearch.runs.results import BankOfConditions

@@ -164,7 +164,7 @@ def attempts(group: Group) -> list[tuple[str, float]]:
 
     Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.
     """
-    forced, steps = "forced" in group.reason, {group.step}
+    forced, steps = group.is_forced, {group.step}
     tries = as_planned(group) if forced else [(name, 1.0) for name in compared(group.valid, group.size)]
     wide = [name for name in ("differences", "secant") if (name, 1.0) in tries][:1]
     for factor in FACTORS[1:]:

@@ -36,7 +36,9 @@ from advsearch.scene.formation import levels_of
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.together import Ensemble
 
-Sent: TypeAlias = tuple[str, Prepared | None, Query]
+ProblemKey = str | float
+"""Tells a problem from others that workers hold: its name, or by how much its ambient light is multiplied."""
+Sent: TypeAlias = tuple[ProblemKey, Prepared | None, Query]
 """The name of the problem, what it has been prepared with, and what is asked."""
 
 
@@ -54,7 +56,7 @@ class Shared:
 
     own: Problem | None
     executor: Executor | None = None
-    name: str = ""
+    name: ProblemKey = ""
 
     @property
     def problem(self) -> Problem:
@@ -91,7 +93,7 @@ class Shared:
                     turn += 1
 
 
-def worker_call(named: Callable[[str], Answerer]) -> Call:
+def worker_call(named: Callable[[ProblemKey], Answerer]) -> Call:
     """Return what answers queries that were sent: what a worker does."""
 
     def call(sent: Sequence[Sent]) -> list[Evaluation]:

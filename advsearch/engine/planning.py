@@ -52,7 +52,7 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
     the model's loss is so rough that none has won, and over shapes the material form is the quietest."""
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in plan.groups:
-        if "forced" not in group.reason and group.valid and (every or group.valid[0] == "adjoint"):
+        if not group.is_forced and group.valid and (every or group.valid[0] == "adjoint"):
             sets.setdefault((group.control, group.valid), []).append(group)
     choices = [
         (tuple(groups), compared(valid, sum(group.size for group in groups))) for (_, valid), groups in sets.items()

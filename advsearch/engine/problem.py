@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import io
 import math
-import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from advsearch import seeds
@@ -21,6 +17,7 @@ from advsearch.attacks import Domain, Evaluation, Objective
 from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
+from advsearch.engine.acceptance import ComparedView, view_of
 from advsearch.engine.judging import (
     ConfigurationInputs,
     Described,
@@ -36,134 +33,13 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import Value
 from advsearch.runs.results import GroupDerivative, PlannedGradient
-from advsearch.scene.assets import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import NO_MAP
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients import GradientPlan
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import Linearised, LinearRenderer, linear_inputs
-from advsearch.tasks import Facts, Judgement, Mark, Prediction, Task
+from advsearch.tasks import Facts, Judgement, Mark, Task
 from advsearch.tasks.base import Output, Truth, mean, typical
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Whether predicted pictures may take the place of rendered ones: the one rule for matrices, basis pictures and light
-# on surfaces, in searches and sweeps (docs/surface-light.md, "How far off predictions may be").
-#
-# A few *views* are traced beside predicted ones. Noise averages out over a search, and bias does not: a search climbs
-# it. So a prediction may be as noisy as a rendered picture, on the object alone, which may be small; and on average
-# over the views it may not move the margin, but for a small part of what the search has moved it.
-
-FIRST, VIEWS = 2, 6  # views that are compared at first, and in all where these don't decide
-MARGIN = 0.3  # mean difference of the margin over the views, with its sign, that is accepted (of a classifier: logits)
-OF_MOVED = 0.05
-"""The same as a share of what the search has moved the margin, where that is more: so much is the length of a step that
-is predicted, and not its direction."""
-BOUND = 2.0  # levels of 255, root mean square over the object, that will do where a rendered picture has less noise
-CLEARLY_GOOD, CLEARLY_BAD = 0.7, 1.4  # shares of what is allowed up to which, and from which on, the first views decide
-ACCEPTED = 0.9  # share of the levels that is accepted in the end, so that one beyond the limit seldom is by chance
-CHECK_SPP = 16  # samples a pixel of each of the two traced pictures of a view
-
-MarginOf = Callable[[Tensor, Tensor], float]
-"""The margin of what a model says of a picture (H, W, 3) of a configuration (d,)."""
-
-
-@dataclass(frozen=True)
-class ComparedView:
-    """A predicted picture beside traced ones: mean squares over the object, levels of 255, of what it is off and of
-    what a rendered one is (below 0 by chance where both are small); by how much its margin is larger; the pictures that
-    were traced; and by how much the search has moved the margin of what is predicted."""
-
-    square: float
-    allowed: float
-    margin: float
-    pictures: int
-    moved: float = 0.0
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """How far predictions are off, over several views: the root mean square over the object in levels of 255, the mean
-    difference of the margin, and the levels that are allowed; so many pictures were traced to find it; and the
-    difference of the margin that is allowed."""
-
-    levels: float
-    logits: float
-    most: float
-    pictures: int
-    margin: float = MARGIN
-
-    @classmethod
-    def of(cls, views: Sequence[ComparedView]) -> Deviation:
-        square, allowed, logits, moved = (
-            statistics.fmean(getattr(view, name) for view in views) for name in ("square", "allowed", "margin", "moved")
-        )
-        pictures = sum(view.pictures for view in views)
-        return cls(_root(square), logits, max(BOUND, _root(allowed)), pictures, max(MARGIN, OF_MOVED * moved))
-
-    @property
-    def share(self) -> float:
-        """Of the levels that are allowed."""
-        return self.levels / self.most if self.most > 0.0 else math.inf
-
-    @property
-    def good(self) -> bool:
-        """Whether predictions may take the place of rendered pictures; never where something is NaN."""
-        return self.share <= ACCEPTED and abs(self.logits) <= self.margin
-
-    @property
-    def reason(self) -> str:
-        if not self.share <= ACCEPTED:
-            return f"{self.levels:.1f} levels of 255 off on the object, where {ACCEPTED * self.most:.1f} would do"
-        return f"{self.logits:+.2f} off in the margin, where {self.margin:.2f} would do"
-
-
-def compared(view: Callable[[int], ComparedView]) -> Deviation:
-    """Compare predictions, in few views where these decide; `view` compares one, by its number below `VIEWS`."""
-    views = [view(number) for number in range(FIRST)]
-    first = Deviation.of(views)
-    clearly = first.share <= CLEARLY_GOOD and abs(first.logits) <= CLEARLY_GOOD * first.margin
-    if not clearly and first.share < CLEARLY_BAD:
-        views += [view(number) for number in range(FIRST, VIEWS)]
-    return Deviation.of(views)
-
-
-def view_of(
-    renderer: Renderer, predicted: Tensor, u: Tensor, seed: int, spp: int, margin: MarginOf,
-    before: Tensor | None = None,
-) -> ComparedView:  # fmt: skip
-    """Compare a predicted picture (H, W, 3) of a configuration u (d,) of the whole space with traced ones. The search
-    renders with `spp` samples a pixel; `before` was predicted in its place before the search, if anything was."""
-    with torch.no_grad():
-        rendered = renderer(u, seeds.stream(seed, "rendered"), spp)
-        *halves, clean = renderer.halves(u, seed, CHECK_SPP)
-        seen = renderer.mask(u)
-    square, allowed = (squares_off(picture, halves, seen) for picture in (predicted, rendered))
-    here = margin(predicted, u)
-    moved = 0.0 if before is None else abs(here - margin(before, u))
-    return ComparedView(square, allowed, here - margin(clean, u), pictures=3, moved=moved)
-
-
-def squares_off(picture: Tensor, halves: Sequence[Tensor], seen: Tensor | None = None) -> float:
-    """Return the mean squared difference, levels of 255, of a picture (H, W, 3) from what two traced ones of
-    independent noise converge to, over the pixels that are seen, (H, W), or all where there are none.
-
-    These are traced without the denoiser, which leaves its own marks in all that it is given. The mean product of the
-    differences to both is the squared error without their noise, which a square would count.
-    """
-    first, second = halves
-    products = (picture - first) * (picture - second)
-    return 255.0**2 * float((products if seen is None or not bool(seen.any()) else products[seen]).mean())
-
-
-def levels_off(renderer: Renderer, pictures: Sequence[Tensor], u: Tensor, seed: int, spp: int) -> list[float]:
-    """Return how far pictures (H, W, 3) of a configuration are off as a whole, levels of 255."""
-    halves = renderer.halves(u, seed, spp)[:2]
-    return [_root(squares_off(picture, halves)) for picture in pictures]
-
-
-def _root(square: float) -> float:
-    """NaN stays NaN."""
-    return 0.0 if square <= 0.0 else math.sqrt(square)
 
 
 class Prepared(NamedTuple):
@@ -571,42 +447,3 @@ def hard_first(values: Tensor) -> Tensor:
     if not bool(torch.isfinite(spread)) or float(spread) == 0.0:
         return torch.ones_like(known)
     return len(known) * torch.softmax(-known / spread, dim=0)
-
-
-# ---- What is changed in a picture to see whether the model says something else, as it must or must not --------------
-
-
-def _brighter(picture: Tensor) -> Tensor:
-    brighter: Tensor = linear_to_srgb(srgb_to_linear(picture) * 2.0 ** (1.0 / 3.0))
-    return brighter
-
-
-def _compressed(picture: Tensor) -> Tensor:
-    file = io.BytesIO()
-    Image.fromarray((picture * 255.0).round().byte().numpy()).save(file, "JPEG", quality=95)
-    return torch.from_numpy(np.array(Image.open(file, formats=["JPEG"]))).to(picture) / 255.0
-
-
-CHANGED: dict[str, Callable[[Tensor], Tensor]] = {
-    "black": torch.zeros_like,
-    "covered": lambda picture: picture.mean(dim=(0, 1)).expand_as(picture).contiguous(),
-    "exposure": _brighter,
-    "shift": lambda picture: torch.cat([picture[:, :1], picture[:, :-1]], dim=1),
-    "jpeg": _compressed,
-}
-"""What makes the changed picture of one (H, W, 3), sRGB in [0, 1]."""
-
-AWAY = "away"  # what is rendered again, see `Assembly.away`
-ALIKE = 0.1  # how far the probability of one label may move, and nothing has changed for `must_change`
-
-
-def changed(picture: Tensor, when: str, cameras: int = 1) -> Tensor:
-    """Return a picture (H, W, 3) that is changed as a name of `CHANGED` says; of a rig those of all its cameras."""
-    return torch.cat([CHANGED[when](part) for part in picture.chunk(cameras, dim=1)], dim=1)
-
-
-def as_claimed(claim: str, before: Prediction, after: Prediction) -> bool:
-    """Return whether a change did what is claimed: that it `must_change` what the model says, or `must_not_change`."""
-    moved = abs((before.probability or 0.0) - (after.probability or 0.0))
-    another = before.label != after.label
-    return another or moved > ALIKE if claim == "must_change" else not another

@@ -23,6 +23,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME, ControlGroup, Fields, Result, VerifiedRate
 from advsearch.runs.store import Row
 from advsearch.runs.summary import NAME, stored_result
+from advsearch.scene.predictor import Refusal
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.base import mean
 
@@ -53,8 +54,8 @@ class Findings:
     frames: list[Any] = field(default_factory=list)  # of the search, (H, W, 3) 8-bit values in [0, 1], numpy
     interrupted: bool = False
     transport: PredictedSearch | None = None  # what predicted the pictures of the searches, if anything did
-    rendered_because: str = ""  # why nothing did, in words
-    surface_refused: str = ""  # why matrices did and not light on surfaces, where that was tried
+    rendered_because: Refusal | None = None  # why nothing did
+    surface_refused: Refusal | None = None  # why matrices did and not light on surfaces, where that was tried
     verification_renders: int = 0  # renders spent on choosing the sample count and on trials
     predicted_trials: int = 0
 
@@ -211,7 +212,7 @@ class Results:
 
 def taken_rows(asked: Any, results: Results, rows: Iterable[Kept], result: Callable[[list[Kept]], Ending]) -> Ending:
     """Take rows until they end, the time is up or there is an interrupt, and write what they come to after each, into
-    the run of what is `asked` (`question.Asked`).
+    the run of what is `asked` (`experiment.RunContext`).
 
     The summary never has fewer rows than an earlier sitting left in it: those are read back first.
     """

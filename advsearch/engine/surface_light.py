@@ -14,12 +14,14 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation, Policy
 from advsearch.attacks.evaluation import Query
+from advsearch.engine.acceptance import VIEWS, ComparedView, Deviation
 from advsearch.engine.bank import stratified
-from advsearch.engine.problem import VIEWS, ComparedView, Deviation, Problem
+from advsearch.engine.problem import Problem
 from advsearch.engine.transport import PredictedSearch
 from advsearch.runs.results import BankOfConditions
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.mitsuba_backend.surface import RAYS
+from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, MAP
 from advsearch.scene.surface.renderer import Look, Sketch, SurfaceRenderer
@@ -28,7 +30,7 @@ from advsearch.scene.transport.matrix import Tick
 WORTH = 32
 """Pictures of a search from which on the light pays: it and a comparison take as long as some 25 rendered ones, or 45
 where the first views do not decide."""
-NO_CAMERA = "no camera moves"  # the reason where light on surfaces has no advantage
+NO_CAMERA = Refusal("no camera moves", RefusalCause.NO_CAMERA)  # where light on surfaces has no advantage
 LIGHTS = 64  # environments in the bank, where they vary
 EVERY = 100
 TOGETHER = 8  # pictures that the model is asked about at once
@@ -37,22 +39,22 @@ AGAIN = 4
 each camera sees is known then."""
 
 
-def reason_against(problem: Problem, steps: int, policy: Policy[Any], specialise: bool) -> str | None:
-    """Why light on surfaces does not predict a search, in words; None if it may: how far it is off is measured then."""
+def refusal_of_surface_light(problem: Problem, steps: int, policy: Policy[Any], specialise: bool) -> Refusal | None:
+    """Return why light on surfaces does not predict a search; None if it may: how far it is off is measured then."""
     if not specialise:
-        return "nothing is left out"
+        return Refusal("nothing is left out")
     if problem.renderer.composed:
-        return problem.renderer.composed
+        return Refusal(problem.renderer.composed)
     names = [control.name for control in problem.space.controls]
     if not surface_renderer.varied(problem.renderer, names) & CAMERAS:
         return NO_CAMERA
     if steps * problem.draws < WORTH:
-        return f"light on surfaces pays from {WORTH} pictures on"
+        return Refusal(f"light on surfaces pays from {WORTH} pictures on", RefusalCause.TOO_FEW_STEPS)
     if policy.takes_differences(problem.domain, steps):
-        return f"{policy.name} takes derivatives that need rendered pictures"
+        return Refusal(f"{policy.name} takes derivatives that need rendered pictures")
     for group in problem.plan.groups:
-        if "forced" in group.reason and group.estimator not in ("none", "image"):
-            return f"the estimator of {group.name} is forced"
+        if group.is_forced and group.estimator not in ("none", "image"):
+            return Refusal(f"the estimator of {group.name} is forced")
     return surface_renderer.why_not(problem.renderer, names)
 
 
@@ -113,9 +115,9 @@ class SurfaceLight(PredictedSearch):
         return self.renderer.entries, self.renderer.bytes
 
     @property
-    def too_far_off(self) -> str | None:
+    def too_far_off(self) -> Refusal | None:
         first = self.deviations[0] if self.deviations else None
-        return None if first is None or first.good else f"light on surfaces is {first.reason}"
+        return None if first is None or first.good else Refusal(f"light on surfaces is {first.reason}")
 
     def predicted(self, kind: str, evaluations: int) -> int:
         if "search" in self.ends and kind != "search":

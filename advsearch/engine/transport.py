@@ -19,12 +19,13 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.engine.problem import ComparedView, Deviation, Problem, compared
+from advsearch.engine.acceptance import ComparedView, Deviation, compared
+from advsearch.engine.problem import Problem
 from advsearch.runs.results import BankOfConditions, LinearTransport, PredictionError
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.predictor import NOISE, Predictor
-from advsearch.scene.transport.lights import HAZE, lights_to_collect, predicting, samples_to_collect, why_not
-from advsearch.scene.transport.matrix import TOO_LARGE, Tick
+from advsearch.scene.predictor import Predictor, Refusal, RefusalCause
+from advsearch.scene.transport.lights import lights_to_collect, predicting, samples_to_collect, why_not
+from advsearch.scene.transport.matrix import Tick
 
 WORTH = 16
 """Evaluations from which a search pays for the matrix, which costs as much as some 6 rendered ones with gradients
@@ -33,35 +34,39 @@ WORTH_A_LIGHT = 8  # evaluations for each light from which a search pays for its
 EVERY = 20
 FEWEST_SCORES = 4  # trials whose spread says something
 SPREAD = 1.64  # standard deviations under their mean above which 19 of 20 scores lie
-AVOIDABLE = {
-    HAZE: "leave the haze out",
-    NOISE: "`denoise=oidn` takes the noise out",
-    TOO_LARGE: "take a lower `resolution` or texture resolution, or set ADVSEARCH_LIMITS=2 where memory allows it",
+ADVICE = {
+    RefusalCause.HAZE: "leave the haze out",
+    RefusalCause.NOISE: "`denoise=oidn` takes the noise out",
+    RefusalCause.TOO_LARGE: "take a lower `resolution` or texture resolution, or set ADVSEARCH_LIMITS=2 where memory "
+    "allows it",
 }
-"""Reasons to render that cost much, and what a user can do instead."""
+"""What a user can do where rendering costs much, by the cause of a refusal."""
 
 
-def reason_against(problem: Problem, steps: int, specialise: bool) -> str | None:
-    """Why a search renders instead of predicting by matrices, in words; None if it predicts."""
+def refusal_of_matrices(problem: Problem, steps: int | None, specialise: bool) -> Refusal | None:
+    """Return why a search of so many steps (None: of any number) is not predicted by matrices; None if it is."""
     if not specialise:
-        return "nothing is left out"
+        return Refusal("nothing is left out")
     if problem.renderer.composed:
-        return problem.renderer.composed
-    if steps < WORTH:
-        return f"a matrix pays from {WORTH} evaluations on"
+        return Refusal(problem.renderer.composed)
+    if steps is not None and steps < WORTH:
+        return Refusal(f"a matrix pays from {WORTH} evaluations on", RefusalCause.TOO_FEW_STEPS)
     by_chance = problem.space.controls[problem.searched :] if problem.conditions is not None else ()
-    reason = why_not(problem.renderer, [control.name for control in by_chance])
-    if reason is None and problem.conditions is None:
+    refusal = why_not(problem.renderer, [control.name for control in by_chance])
+    if refusal is None and problem.conditions is None and steps is not None:
         worth = WORTH_A_LIGHT * lights_to_collect(problem.renderer)
-        return f"basis pictures pay from {worth} evaluations on" if steps < worth else None
-    return reason
+        if steps < worth:
+            return Refusal(f"basis pictures pay from {worth} evaluations on", RefusalCause.TOO_FEW_STEPS)
+    return refusal
 
 
-def remark(reason: str) -> str:
-    """Return what a user should know of a search that renders for a reason; empty where it has to."""
-    instead = next((what for why, what in AVOIDABLE.items() if reason.startswith(why)), "")
+def remark(refusal: Refusal | None) -> str:
+    """Return what a user should know of a search that renders; empty where nothing else is possible."""
+    advice = "" if refusal is None else ADVICE.get(refusal.cause, "")
+    if not advice:
+        return ""
     costs = "Each step of the search is rendered, which takes several times as long as predicting it"
-    return f"{costs}: {reason}; {instead}." if instead else ""
+    return f"{costs}: {refusal}; {advice}."
 
 
 @dataclass

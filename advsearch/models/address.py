@@ -33,7 +33,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.errors import InputError, ModelError, UnknownNameError
+from advsearch.errors import CodeNotAllowedError, InputError, ModelError, UnknownNameError
 from advsearch.files import parse_json, scaled
 from advsearch.interrupts import INTERRUPTS
 from advsearch.models.model import Model, Preprocessing
@@ -80,7 +80,7 @@ def load(spec: str, purpose: Purpose) -> Model:
     a file names it, or as `checked`; ModelError: it cannot do what it is to be asked, or nobody answers."""
     address = checked(spec)
     if not may_fetch(spec):
-        raise InputError(
+        raise CodeNotAllowedError(
             f"a file names the model {spec}, to which pictures would be sent, and the key in {KEY}; "
             f"{how_to_allow(spec)}"
         )

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from advsearch.config import SceneConfig
-from advsearch.question import Asked, question
+from advsearch.experiment import RunContext, experiment
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, GREY, RED
@@ -70,25 +70,6 @@ class GapResult(InNotebook, StudyResult):
     table: list[GapRow]
 
 
-@question(
-    "gap --object mug --control pose,camera,texture",
-    "gap --object mug,bowl,bottle --control pose --average 500 --steps 80",
-    place=("object", "model"),
-)
-def gap(asked: Asked[GapConfig]) -> GapResult:
-    """Compare the worst configuration with the average, for each object and each control (docs/questions.md)."""
-    from advsearch.questions.attack.studies import StudyRun  # imports torch
-
-    study, rows = StudyRun(asked), list[GapRow]()
-    for (one,) in study.chains:
-        summary = study.attack(one)
-        if summary is not None and summary.average is not None:
-            worst = summary.verified
-            own = {"object": one.config.object, "control": one.of, "worst": worst, "margin": worst and worst.margin}
-            rows.append(GapRow.of({**vars(summary), **own}))
-    return study.result(GapResult, table=rows)
-
-
 def shown(result: GapResult) -> ShownResult:
     columns: dict[str, Column] = {
         "object": "{0.object}",
@@ -141,3 +122,24 @@ def claims(result: GapResult) -> Iterator[Claim]:
         yield average_claim(row.average, name)
         spent = searches_text(row.renders, result.policy, bool(row.renders.get("baseline")))
         yield case_claim(name, row.ending, row.worst, spent)
+
+
+@experiment(
+    "gap --object mug --control pose,camera,texture",
+    "gap --object mug,bowl,bottle --control pose --average 500 --steps 80",
+    positional_args=("object", "model"),
+    view=shown,
+    claims=claims,
+)
+def gap(asked: RunContext[GapConfig]) -> GapResult:
+    """Compare the worst configuration with the average, for each object and each control (docs/questions.md)."""
+    from advsearch.questions.attack.studies import StudyRun  # imports torch
+
+    study, rows = StudyRun(asked), list[GapRow]()
+    for (one,) in study.chains:
+        summary = study.attack(one)
+        if summary is not None and summary.average is not None:
+            worst = summary.verified
+            own = {"object": one.config.object, "control": one.of, "worst": worst, "margin": worst and worst.margin}
+            rows.append(GapRow.of({**vars(summary), **own}))
+    return study.result(GapResult, table=rows)

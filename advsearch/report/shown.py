@@ -124,8 +124,9 @@ class ShownResult:
 
 
 def shown(result: Result) -> ShownResult:
-    made: ShownResult = (registry.part_of(result.command, "shown") or fields_shown)(result)
-    return made
+    make_view = registry.get_experiment(result.command).view or fields_shown
+    view: ShownResult = make_view(result)
+    return view
 
 
 def remarks_of(result: Result, given: ShownResult) -> list[str]:

@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import errno
-import importlib
 import itertools
 import json
-import logging
 import os
 import re
 import shutil
-import threading
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from queue import Full, Queue
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
-from advsearch.files import JsonObject, open_regular
+from advsearch.files import open_regular
 from advsearch.runs import files, store, summary
 from advsearch.runs.files import PART, storage_errors, write_bytes, write_text
-from advsearch.runs.store import Row
-from advsearch.settings import HEADER, settings
+from advsearch.runs.trackers import Tracker, check_tracker
+from advsearch.settings import HEADER, PythonOnly, settings
 from advsearch.yaml_text import LARGEST
 
 if TYPE_CHECKING:
@@ -43,7 +38,7 @@ OBJECT_FILE = f"{ARTIFACTS}/object.glb"  # what was attacked, before and after, 
 AOV_FOLDER = "aov"  # of a sweep: the ground truth of each picture, by its number
 PARTS = "parts"  # runs that a study consists of
 
-ONLY_HERE = "only in Python"  # the note of what a run has, in words, that no file and no command can name
+ONLY_HERE = "only in Python"  # the note of parts that no file and no command can name: pairs of role and name
 BEGUN_WITH = "settings"  # the note of what decides the run's numbers, as it was when the run began
 
 CONTENTS = (
@@ -339,13 +334,14 @@ def find_run(run: str | Path, *, checked: bool = True) -> Path:
     raise UnknownNameError("run", str(run), known, "Give a name in runs/ or the path of a run's folder.")
 
 
-def only_here(path: Path) -> list[str]:
-    """Return what a run has, in words, that existed only in the Python session that asked for it."""
+def read_python_only(path: Path) -> list[PythonOnly]:
+    """Return the parts of a run that existed only in the Python session that made it."""
     if not (path / store.NAME).is_file():
         return []
     with store.Store(path / store.NAME, read_only=True) as results:
         noted = results.noted(ONLY_HERE)
-    return [str(one) for one in noted] if isinstance(noted, list) else []
+    pairs = noted if isinstance(noted, list) else []
+    return [PythonOnly(str(pair[0]), str(pair[1])) for pair in pairs if isinstance(pair, list) and len(pair) == 2]
 
 
 def is_run(path: Path) -> bool:
@@ -429,114 +425,3 @@ def _remove_if_bare(path: Path) -> None:
             for found in list(path.iterdir()):
                 found.unlink()
             path.rmdir()
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# What is evaluated, told to MLflow, TensorBoard or Weights & Biases: settings, and the mean numbers of rows by kind. A
-# thread of its own tells it, so that neither a slow network nor one that fails holds up the run.
-
-PACKAGES = {"mlflow": "mlflow", "tensorboard": "tensorboard.summary", "wandb": "wandb"}
-"""The trackers, and what of each is imported."""
-
-NUMBERS = ("objective", "score", "margin", "correct", "success", "probability")
-PATIENCE = 10.0  # seconds that the end of a run waits for what is still to be told
-WAITING = 10_000  # messages that may wait; further ones are not told
-LONGEST = 250
-_LOG = logging.getLogger("advsearch")
-
-MetricValues = Mapping[str, float]
-
-
-def check_tracker(name: str | None) -> None:
-    if name is None:
-        return
-    if name not in PACKAGES:
-        raise UnknownNameError("log", name, PACKAGES)
-    _package(name)
-
-
-def _package(name: str) -> Any:
-    try:
-        return importlib.import_module(PACKAGES[name])
-    except ImportError:
-        raise InputError(f"log {name}: needs {name}; pip install {name}, or leave `log` out") from None
-
-
-class Tracker:
-    """Tells rows to a tracker from a thread of its own."""
-
-    def __init__(self, name: str, folder: Path, settings: JsonObject) -> None:
-        self._name = name
-        self._right: dict[str, list[int]] = defaultdict(lambda: [0, 0])
-        self._waiting: Queue[tuple[MetricValues, int] | None] = Queue(WAITING)
-        told = {key: str(value)[:LONGEST] for key, value in settings.items() if value is not None}
-        self._thread = threading.Thread(target=self._work, args=(folder, told), name=name, daemon=True)
-        self._thread.start()
-
-    def rows(self, rows: Sequence[Row]) -> None:
-        """Tell rows that were kept; returns at once."""
-        kinds: dict[str, list[Row]] = defaultdict(list)
-        for row in rows:
-            kinds[row.kind].append(row)
-        for kind, group in kinds.items():
-            self._put((self._numbers(kind, group), group[-1].step))
-
-    def close(self) -> None:
-        """Wait, at most `PATIENCE` seconds, until all is told; a second call does nothing."""
-        self._put(None)
-        self._thread.join(PATIENCE)
-
-    def _numbers(self, kind: str, rows: Sequence[Row]) -> MetricValues:
-        numbers = {}
-        for name in NUMBERS:
-            given = [float(value) for row in rows if (value := getattr(row, name)) is not None]
-            if given:
-                numbers[f"{kind}/{name}"] = sum(given) / len(given)
-        judged = [row.correct for row in rows if row.correct is not None]
-        counts = self._right[kind]
-        counts[0], counts[1] = counts[0] + sum(judged), counts[1] + len(judged)
-        if counts[1]:
-            numbers[f"{kind}/accuracy"] = counts[0] / counts[1]
-        return numbers
-
-    def _put(self, message: tuple[MetricValues, int] | None) -> None:
-        try:
-            self._waiting.put_nowait(message)
-        except Full:
-            return  # a tracker that is that slow is told less; the run has all of it
-
-    def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
-        try:
-            tell, close = _opened(self._name, folder, settings)
-            while (message := self._waiting.get()) is not None:
-                tell(*message)
-            close()
-        except Exception as error:  # whatever a tracker does, the run goes on
-            _LOG.warning("%s is told nothing more: %s", self._name, str(error)[:300] or type(error).__name__)
-
-
-def _opened(
-    name: str, folder: Path, settings: Mapping[str, str]
-) -> tuple[Callable[[MetricValues, int], object], Callable[[], object]]:
-    """Return what tells a tracker numbers by name, of a step of their kind, and what ends its run."""
-    package = _package(name)
-    if name == "mlflow":
-        package.start_run(run_name=folder.name, nested=True)
-        package.log_params(settings)
-        return lambda numbers, step: package.log_metrics(dict(numbers), step=step), package.end_run
-    if name == "tensorboard":  # its files are in the run, whose run.yaml has the settings
-        writer = package.Writer(str(folder / "artifacts" / "tensorboard"))
-
-        def add(numbers: MetricValues, step: int) -> None:
-            for each, value in numbers.items():
-                writer.add_scalar(each, value, step)
-
-        return add, writer.close
-    run = package.init(project="advsearch", name=folder.name, config=dict(settings), reinit="create_new")
-
-    def log(numbers: MetricValues, step: int) -> None:
-        # each kind has steps of its own, which are told as a number: its one counter only ever goes up
-        kind = next(iter(numbers), "rows/").partition("/")[0]
-        run.log({**numbers, f"{kind}/step": step})
-
-    return log, run.finish

@@ -504,8 +504,11 @@ class SharedWork(Fields):
 
 
 def kind_of(values: JsonObject) -> type[Result] | None:
-    """Return the result that the values of a `summary.json` are of; None if there is none of that command."""
+    """Return the class of the result that a `summary.json` has; None where there is no such experiment."""
     command = str(values.get("command"))
-    others = registry.part_of(command, "others") or {}
-    main: type[Result] | None = registry.part_of(command, "result")
-    return next((kind for name, kind in others.items() if name in values), main)
+    if command not in registry.EXPERIMENTS:
+        return None
+    experiment = registry.get_experiment(command)
+    candidates: dict[str, type[Result]] = dict(experiment.other_results)
+    main_type: type[Result] = experiment.result
+    return next((result_type for field, result_type in candidates.items() if field in values), main_type)

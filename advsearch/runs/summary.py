@@ -74,7 +74,6 @@ def other_summary(path: Path, got: str) -> FileFormatError:
 
 
 CONFIGURATION = "adversarial.npy"
-FORMERLY = "answer.npy"  # what runs that were made before call it
 FOLDER = "artifacts"
 LARGEST_CONFIGURATION = 1 << 30
 MAGIC = b"\x93NUMPY\x01\x00"  # how a file of numpy's begins, of version 1.0
@@ -95,9 +94,7 @@ def write_configuration(run: Path, u: NDArray[np.float32]) -> Path:
 
 def read_configuration(run: Path) -> NDArray[np.float32]:
     """Return the configuration (d,) float32 in [0, 1] that a run found, or raise a FileFormatError."""
-    path, older = run / FOLDER / CONFIGURATION, run / FOLDER / FORMERLY
-    if older.is_file() and not path.exists():
-        path = older
+    path = run / FOLDER / CONFIGURATION
     expected = f"{path}: expected the adversarial configuration of a run, got"
     try:
         data = read_bytes(path, "the adversarial configuration of a run", LARGEST_CONFIGURATION)

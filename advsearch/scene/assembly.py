@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Mesh, Shape, linear_to_srgb
+from advsearch.scene.assets import Mesh, Shape
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import camera_to_world, driving, projected, seated
 from advsearch.scene.gradients import Group

@@ -23,7 +23,8 @@ from torch import Tensor
 from advsearch import files
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.scene.assembly import posed
-from advsearch.scene.assets import Material, Mesh, Shape, linear_to_srgb, pose_of
+from advsearch.scene.assets import Material, Mesh, Shape, pose_of
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import glb

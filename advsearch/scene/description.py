@@ -1,8 +1,8 @@
 """A scene as data: meshes, of which one is the object, lamps, an environment and the settings; nothing of Mitsuba.
 
 Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is 1 before `pose.scale`), angles
-in degrees. Lengths of the camera and of a photograph's floor (`advsearch.config.LENGTHS`) and paths of files are in
-metres where the object has a size in metres. The camera at azimuth 0 and elevation 0 looks from +x towards the object.
+in degrees. Lengths of the camera and of a photograph's floor and paths of files are in metres where the object has a
+size in metres. The camera at azimuth 0 and elevation 0 looks from +x towards the object.
 """
 
 from __future__ import annotations

@@ -19,16 +19,8 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import (
-    LOW_END,
-    Doubles,
-    EnvironmentAsset,
-    Floats,
-    Ints,
-    face_vectors,
-    linear_to_srgb,
-    srgb_to_linear,
-)
+from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Ints, face_vectors
+from advsearch.scene.color import LOW_END, linear_to_srgb, srgb_to_linear
 from advsearch.scene.geometry import NEAREST, camera_to_world, object_to_world, rotation, standing
 from advsearch.scene.grounds import paved
 from advsearch.scene.parts import MeshPart

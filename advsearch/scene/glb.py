@@ -17,7 +17,8 @@ import numpy.typing as npt
 from PIL import Image
 
 from advsearch.pictures import png_of
-from advsearch.scene.assets import Doubles, Floats, Shape, linear_to_srgb
+from advsearch.scene.assets import Doubles, Floats, Shape
+from advsearch.scene.color import linear_to_srgb
 
 # ---- The buffer of a binary glTF file, and the file around it -------------------------------------------------------
 

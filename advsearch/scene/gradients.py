@@ -51,6 +51,7 @@ class Group:
     step: float = 0.0  # half-width of a difference in u; 0 where none is taken
     pixel: float = 0.0  # that over which the fastest outline moves by a pixel; that of the group where nothing moves
     reason: str = ""  # why this estimator, in words
+    is_forced: bool = False  # the caller named the estimator, or nobody uses the derivative: it is not compared
     measured: Mapping[str, float] = field(default_factory=dict)  # variance x time of each valid one, where measured
 
     @property
@@ -138,8 +139,10 @@ class GradientPlan:
         return mask
 
     def with_estimator(self, names: Mapping[str, str], reason: str) -> GradientPlan:
-        """Return the plan with the estimators of some groups replaced, by `control.parameter`."""
-        chosen = {name: {"estimator": estimator, "reason": reason} for name, estimator in names.items()}
+        """Return the plan with the estimators of some groups forced, by `control.parameter`."""
+        chosen = {
+            name: {"estimator": estimator, "reason": reason, "is_forced": True} for name, estimator in names.items()
+        }
         return self._changed(lambda group: chosen.get(group.name, {}))
 
     def with_steps(self, factor: float) -> GradientPlan:
@@ -215,10 +218,10 @@ def _first(group: Group, steps: Tensor, forced: Mapping[str, str], across: float
                 f"`estimators` {group.name}={wanted}: not valid there; expected one of "
                 f"{', '.join(dict.fromkeys((*group.valid, *ALWAYS_VALID)))}"
             )
-        return replace(group, estimator=wanted, step=step, reason="forced by name")
+        return replace(group, estimator=wanted, step=step, reason="forced by name", is_forced=True)
     everywhere = forced.get("*", "")
     if everywhere in group.valid or (everywhere in ALWAYS_VALID and "image" not in group.valid):
-        return replace(group, estimator=everywhere, step=step, reason="forced for all")
+        return replace(group, estimator=everywhere, step=step, reason="forced for all", is_forced=True)
     only = len(group.valid) == 1
     reason = "the only valid estimator" if only else f"preferred among {', '.join(group.valid)}; not measured"
     return replace(group, estimator=group.valid[0], step=step, reason=reason)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 import torch
@@ -11,8 +13,33 @@ from torch import Tensor
 
 from advsearch.scene.renderer import Renderer
 
-NOISE = "noise is part of the picture without the denoiser"
-"""A reason against predictions that stands alone: with the denoiser, the same pictures could be predicted."""
+
+class RefusalCause(Enum):
+    """Why a predictor does not make the images of a search, as far as code has to know it."""
+
+    UNSUITABLE = "the scene, the space or the policy"
+    TOO_FEW_STEPS = "it does not pay for so few images"
+    NO_CAMERA = "no camera moves"
+    HAZE = "haze"
+    NOISE = "no denoiser"
+    TOO_LARGE = "memory"
+    NOTHING_MOVES = "nothing changes that it could follow"
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why images are rendered and not predicted: a text that completes "rendered: ...", and its cause."""
+
+    text: str
+    cause: RefusalCause = RefusalCause.UNSUITABLE
+
+    def __str__(self) -> str:
+        return self.text
+
+
+NOTHING_MOVES = Refusal("nothing that varies is what it predicts", RefusalCause.NOTHING_MOVES)
+NOISE = Refusal("noise is part of the picture without the denoiser", RefusalCause.NOISE)
+"""A refusal that stands alone: with the denoiser, the same images could be predicted."""
 BETWEEN = (0.02, 0.29, 0.61, 0.97)  # places in the range of a parameter at which its effect on the inputs is looked up
 MOST_BYTES = 2**30  # memory of what one predictor keeps, times `ADVSEARCH_LIMITS`
 

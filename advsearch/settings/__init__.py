@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from advsearch.settings.configuration import FILES, Clash, Config, Setting, setting, setting_as_in, settings
+from advsearch.settings.configuration import FILES, Clash, Config, PythonOnly, Setting, setting, setting_as_in, settings
 from advsearch.settings.values import (
     HEADER,
     all_finite,
@@ -24,7 +24,26 @@ from advsearch.settings.values import (
 )
 
 __all__ = [
-    "FILES", "HEADER", "Clash", "Config", "Setting", "all_finite", "as_python", "as_text", "check_once", "each_once",
-    "names_together", "number_or_text", "parse_assignment", "read_controls", "read_yaml", "setting",
-    "setting_as_in", "settings", "shown", "split_names", "texts",
-]  # fmt: skip
+    "FILES",
+    "HEADER",
+    "Clash",
+    "Config",
+    "PythonOnly",
+    "Setting",
+    "all_finite",
+    "as_python",
+    "as_text",
+    "check_once",
+    "each_once",
+    "names_together",
+    "number_or_text",
+    "parse_assignment",
+    "read_controls",
+    "read_yaml",
+    "setting",
+    "setting_as_in",
+    "settings",
+    "shown",
+    "split_names",
+    "texts",
+]

@@ -193,6 +193,22 @@ class SettingsError(InputError):
         self.problems = problems
 
 
+class PythonOnly(NamedTuple):
+    """A part of a run that exists only in the Python session that made it: no file and no command can name it.
+
+    Attributes:
+        role: what the run has it for: "model", "scene", "objective", "policy", "metric", "control", "task", ...
+        name: its name there; empty where it has none.
+    """
+
+    role: str
+    name: str = ""
+
+    @property
+    def text(self) -> str:
+        return f"the {self.role} {self.name}".rstrip()
+
+
 class Config(BaseModel):
     """What a command needs to know. Frozen; unknown names are refused. Each command's configuration is a subclass.
     Raises InputError: a value is outside its range or an unknown setting is named; the message lists every problem."""
@@ -200,16 +216,14 @@ class Config(BaseModel):
     command: ClassVar[str]
     without: ClassVar[tuple[str, ...]] = ()  # settings of a class above that the command does not have
     clashes: ClassVar[tuple[Clash, ...]] = ()
-    formerly: ClassVar[Mapping[str, str]] = {}  # earlier names of settings, which files and flags may still have
     free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")  # they decide no number: they may change before a run goes on
 
-    _only_here: tuple[str, ...] = PrivateAttr(())
+    _only_here: tuple[PythonOnly, ...] = PrivateAttr(())
     _left_out: tuple[LeftOut, ...] = PrivateAttr(())
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
     def __init__(self, **data: Any) -> None:
-        data = {self.formerly.get(name, name): value for name, value in data.items()}
         deep = {name: value for name, value in data.items() if not is_shallow(value)}
         if deep:
             raise _settings_error(type(self), [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])
@@ -255,7 +269,7 @@ class Config(BaseModel):
         there. Raises FileFormatError, or InputError as for the class; the message names the file.
         """
         data = {name: value for name, value in written.read_yaml(path).items() if name != "command"}
-        schema = data.pop("schema", written.SCHEMA)
+        data.pop("schema", None)  # checked by `read_yaml`
         for name, value in (overrides or {}).items():
             written.put(data, name, value)
         try:
@@ -265,12 +279,7 @@ class Config(BaseModel):
         except SettingsError as error:
             raise SettingsError(error.problems, path) from None
         made._left_out = tuple(left)
-        if schema == written.OLDEST:
-            made.check_older(path)
         return made
-
-    def check_older(self, path: str | Path) -> None:
-        """Refuse, by a FileFormatError, what a file of an older schema meant otherwise."""
 
     @property
     def powers(self) -> tuple[LeftOut, ...]:
@@ -316,14 +325,14 @@ class Config(BaseModel):
         return cls(**{**cls.shared(other), **changes}).with_only_here(other.only_here)
 
     @property
-    def only_here(self) -> tuple[str, ...]:
-        """What it has, in words, that only this Python session has, and no file or command can name."""
+    def only_here(self) -> tuple[PythonOnly, ...]:
+        """Its parts that exist only in this Python session."""
         return self._only_here
 
-    def with_only_here(self, what: Sequence[str]) -> Self:
-        """Return it with other things that only this Python session has."""
+    def with_only_here(self, parts: Sequence[PythonOnly]) -> Self:
+        """Return a copy with other parts that exist only in this Python session."""
         copy = self.model_copy()
-        copy._only_here = tuple(what)
+        copy._only_here = tuple(parts)
         return copy
 
     def to_yaml(self) -> str:
@@ -376,7 +385,7 @@ class Config(BaseModel):
         return shlex.join(words)
 
     def _in_words(self) -> str:
-        *first, last = map(written.shown, self._only_here)
+        *first, last = (written.shown(part.text) for part in self._only_here)
         listed = f"{', '.join(first)} and {last}" if first else last
         return f"{listed} {'exist' if first else 'exists'} only in the Python session that asked."
 

@@ -158,7 +158,7 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-SCHEMA, OLDEST = 2, 1  # version of the YAML form, and the oldest that is read
+SCHEMA = 2  # version of the YAML form
 HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
 """First line of every `run.yaml` that advsearch writes; a run directory is recognised by it."""
 MOST_BASES = 4  # most files that a `base` names, and most that are one another's base
@@ -173,7 +173,7 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, objec
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
         got = "an empty file" if data is None else type(data).__name__
         raise FileFormatError(f"{path}: expected settings and values such as 'object: mug', got {got}")
-    if data.get("schema", SCHEMA) not in range(OLDEST, SCHEMA + 1):
+    if data.get("schema", SCHEMA) != SCHEMA:
         got = shown(data["schema"])
         raise FileFormatError(f"{path}: expected schema {SCHEMA}, got {got}; it is of another advsearch")
     bases = data.pop("base", None) or []

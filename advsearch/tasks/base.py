@@ -29,13 +29,6 @@ Truth = Any  # what is true of a scene, as its task needs it: the right classes,
 Own = TypeVar("Own", bound="Task")
 
 
-FORMERLY = {
-    "answers": "predictions", "answerable": "as_logits", "looks": "calibrates", "seeing": "after_calibration",
-    "unsaid": "ambiguities", "margin": "loss",
-}  # fmt: skip
-"""What parts of a task were called before."""
-
-
 @dataclass(frozen=True)
 class Prediction:
     """One prediction of a model about a picture.
@@ -247,8 +240,6 @@ class Task(ABC):
 
     def __init_subclass__(cls, **more: Any) -> None:
         super().__init_subclass__(**more)
-        for old in FORMERLY.keys() & vars(cls).keys():
-            raise InputError(f"task {cls.__name__}: `{old}` is called `{FORMERLY[old]}` now; rename it")
         asked = "loss score predictions payloads marks judge said average after_calibration as_logits".split()
         hand_copies(cls, truth_names=slice(None), **dict.fromkeys(asked, slice(None)))
 

@@ -156,8 +156,8 @@ def write_page(run: Path, result: Result | None = None) -> Path:
 def page_of(run: Path, result: Result) -> str:
     """Return the page of a run, which needs no other file but those of its parts. Raises FileFormatError where other
     results of the run are damaged."""
-    page = registry.part_of(result.command, "page")
-    made: str | None = page(run, result) if page else None
+    make_page = registry.get_experiment(result.command).page
+    made: str | None = make_page(run, result) if make_page else None
     return made or shown_page(run, result, showing.shown(result))
 
 

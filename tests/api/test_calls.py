@@ -16,7 +16,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch import losses
 from advsearch.attacks import get_objective
-from advsearch.calls import SYNONYMS, check_types, unexpected
+from advsearch.calls import OTHER_TERMS, check_types, unexpected
 from advsearch.controls import NumberControl, Parameter, compose
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
@@ -29,19 +29,11 @@ FUNCTIONS = [name for name in advsearch.__all__ if inspect.isfunction(getattr(ad
 @pytest.mark.parametrize(
     ("name", "keyword", "meant"),
     [
-        ("attack", "loss", "`objective`"),
-        ("attack", "lr", "`policy`"),
-        ("attack", "step_size", "`policy`"),
-        ("attack", "verbose", "`progress`"),
-        ("attack", "eps", "`epsilon`"),
-        ("attack", "num_steps", "`steps`"),
+        ("attack", "eot", "`over`"),
+        ("attack", "minimal_perturbation", "`smallest`"),
         ("attack", "epsilons", "`epsilon`"),
-        ("sweep", "batch_size", "`batch`"),
         ("sweep", "n_samples", "`samples`"),
         ("load_scene", "enviroment", "`environment`"),
-        ("render", "image_size", "`resolution`"),
-        ("load_run", "path_out", "`run`"),
-        ("load_model", "classes", "`labels`"),
     ],
 )
 def test_a_keyword_of_elsewhere_is_told_what_it_is_called_here(name: str, keyword: str, meant: str) -> None:
@@ -65,9 +57,9 @@ def test_every_function_says_which_keywords_it_has_not(name: str) -> None:
         getattr(advsearch, name)("mug", **{wrong: 1})
 
 
-def test_every_synonym_leads_to_a_keyword_of_some_function() -> None:
+def test_every_other_term_leads_to_a_keyword_of_some_function() -> None:
     known = {key for name in FUNCTIONS for key in inspect.signature(getattr(advsearch, name)).parameters}
-    assert set(SYNONYMS) <= known
+    assert set(OTHER_TERMS.values()) <= known
     assert unexpected("f", {"a": 1}, ["a"]) is None
 
 

@@ -20,7 +20,7 @@ from advsearch.controls import make_control, make_space
 from advsearch.questions.attack.result import write_object
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import OBJECT_FILE, RunDirectory
-from advsearch.scene.assets import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba

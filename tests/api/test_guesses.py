@@ -195,12 +195,10 @@ def test_an_objective_that_takes_the_picture_first_is_told(scene: advsearch.Scen
     ("words", "told"),
     [
         (["mug"], "expected flags, got 'mug'; for the object write --object mug"),
-        (["--width", "3"], "has no --width; did you mean --resolution?"),
-        (["--num-steps=3"], "has no --num-steps; did you mean --steps?"),
+        (["--eot", "camera"], "has no --eot; did you mean --over?"),
+        (["--num-steps=3"], "unknown flag '--num-steps'. Did you mean '--steps'"),
         (["--device", "cuda"], "has no --device (pictures are made on the processor"),
-        (["--policy", "fgsm"], "unknown policy 'fgsm'. Did you mean 'pgd'?"),
-        (["--objective", "ce"], "unknown objective 'ce'. Did you mean 'cross_entropy'?"),
-        (["--control", "color"], "unknown control 'color'. Did you mean 'material'?"),
+        (["--control", "camra"], "unknown control 'camra'. Did you mean 'camera'?"),
         (["--control", "yaw"], "It is a parameter: write pose.yaw."),
     ],
 )

@@ -38,7 +38,7 @@ SHORT: dict[str, Any] = {
 
 
 def carried_out(run: Path, **more: Any) -> MatrixResult:
-    result = attack.from_config(AttackConfig(**{**SHORT, "model": BOTH, "run": str(run), **more}))
+    result = attack.run(AttackConfig(**{**SHORT, "model": BOTH, "run": str(run), **more}))
     assert isinstance(result, MatrixResult)
     return result
 
@@ -91,7 +91,7 @@ def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
     monkeypatch.setattr(Retrials, "_rendered", stopped)
     first = carried_out(tmp_path / "run")
     assert first.ending == "interrupted" and first.goes_on
-    again = attack.from_config(AttackConfig.from_yaml(tmp_path / "run" / "run.yaml"), resumed=tmp_path / "run")
+    again = attack.run(AttackConfig.from_yaml(tmp_path / "run" / "run.yaml"), resumed=tmp_path / "run")
     assert isinstance(again, MatrixResult) and again.ending == "done"
     assert [row.tested for row in again.table] == [row.tested for row in whole.table]
     assert done < 2 * 6 * 3 + 2, "what was tried is not tried again"

@@ -11,7 +11,7 @@ import pytest
 
 from advsearch.cluster import Done, Work, Workforce
 from advsearch.errors import ClusterError
-from advsearch.question import Asked, carried_out
+from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack import studies as parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import chains_of, curve
@@ -64,9 +64,9 @@ def rows(path: Path) -> list[Any]:
 
 
 def test_a_shared_gap_is_the_one_that_was_made_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = gap.from_config(SMALL.model_copy(update={"run": str(tmp_path / "alone")}))
+    alone = gap.run(SMALL.model_copy(update={"run": str(tmp_path / "alone")}))
     elsewhere(monkeypatch)
-    shared = gap.from_config(SMALL.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
+    shared = gap.run(SMALL.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
     assert [(one.control, one.ending, one.margin) for one in shared.table] == [
         (one.control, one.ending, one.margin) for one in alone.table
     ]
@@ -83,7 +83,7 @@ def test_an_attack_of_which_every_worker_dies_ends_the_study_by_its_name(
 ) -> None:
     elsewhere(monkeypatch, lost="no answer: 3 workers died of it")
     with pytest.raises(ClusterError, match=r"mug with camera.azimuth: no answer: 3 workers died of it; leave it out"):
-        gap.from_config(SMALL.model_copy(update={"run": str(tmp_path / "run"), "workers": 2}))
+        gap.run(SMALL.model_copy(update={"run": str(tmp_path / "run"), "workers": 2}))
 
 
 def test_a_gap_is_every_object_with_every_control() -> None:
@@ -102,9 +102,9 @@ def test_a_shared_curve_tries_no_epsilon_more_than_one_that_was_made_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = AttackConfig.of(SMALL, controls={"texture": {"resolution": 2}}, epsilon="0.02,0.01", average=0)
-    alone = carried_out(curve, Asked(small.model_copy(update={"run": str(tmp_path / "alone")})))
+    alone = run_and_save(curve, RunContext(small.model_copy(update={"run": str(tmp_path / "alone")})))
     elsewhere(monkeypatch)
-    shared = carried_out(curve, Asked(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2})))
+    shared = run_and_save(curve, RunContext(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2})))
     assert shared.parts == alone.parts and shared.curve == alone.curve
     for name in alone.parts:
         assert rows(tmp_path / "shared" / "parts" / name) == rows(tmp_path / "alone" / "parts" / name)

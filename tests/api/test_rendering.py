@@ -17,7 +17,7 @@ from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.report.figures import GAP, LINE, NARROWEST, columns_for, contact_sheet
 from advsearch.runs.files import read_png
-from advsearch.scene.assets import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 
 SMALL = ["--resolution", "16", "--spp", "1", "--quiet"]
 

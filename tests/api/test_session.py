@@ -470,7 +470,7 @@ def test_an_objective_of_ones_own_stands_beside_the_score_of_every_trial(
 
 def test_a_run_that_is_killed_while_it_loads_goes_on(tmp_path: Path) -> None:
     """By the command line and from Python: the folder is there before anything is loaded."""
-    from advsearch.question import carry_out
+    from advsearch.experiment import run_experiment
 
     run = tmp_path / "new" / "run"
 
@@ -482,11 +482,11 @@ def test_a_run_that_is_killed_while_it_loads_goes_on(tmp_path: Path) -> None:
         raise InterruptedError
 
     for ask in (
-        lambda: carry_out(config),
+        lambda: run_experiment(config),
         lambda: advsearch.attack("mug", run=run, **SMALL),
         lambda: advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, run=run),
-        lambda: carry_out(SweepConfig(object="mug", grid={"pose.yaw": [0, 90]}, run=str(run))),
-        lambda: carry_out(RegionConfig(object="mug", controls="pose", run=str(run))),
+        lambda: run_experiment(SweepConfig(object="mug", grid={"pose.yaw": [0, 90]}, run=str(run))),
+        lambda: run_experiment(RegionConfig(object="mug", controls="pose", run=str(run))),
     ):
         with pytest.MonkeyPatch.context() as patch:
             for module in ("questions.attack.carry_out", "questions.sweep.carry_out"):

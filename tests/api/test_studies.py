@@ -20,7 +20,7 @@ from advsearch.cli.output import shown_text as region_text
 from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.question import Asked, carried_out, carry_out
+from advsearch.experiment import RunContext, run_and_save, run_experiment
 from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
@@ -70,7 +70,7 @@ def summary_of(config: AttackConfig, run: str) -> AttackSummary:
 
 def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]) -> None:
     config = AttackConfig(object="mug,bowl,vase,pan", epsilon="0.1,0.01,0.05", run="study")
-    summary = carried_out(curve, Asked(config))
+    summary = run_and_save(curve, RunContext(config))
     told = [(one.epsilon, one.robust, one.found, one.already_wrong) for one in summary.curve]
     assert told == [(0.01, 3, 0, 1), (0.05, 2, 1, 1), (0.1, 1, 2, 1)]
     low, high = summary.curve[1].interval
@@ -87,7 +87,7 @@ def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]
 
 
 def test_a_label_for_several_objects_says_whose_own_it_is_not(asked: list[AttackConfig]) -> None:
-    summary = carried_out(curve, Asked(AttackConfig(object="mug,bowl", label="mug", run="curve")))
+    summary = run_and_save(curve, RunContext(AttackConfig(object="mug,bowl", label="mug", run="curve")))
     assert any("also for bowl (its own is 'bowl')" in text for text in summary.warnings)
 
 
@@ -99,11 +99,11 @@ def test_an_attack_on_several_objects_or_epsilons_is_a_curve(
     monkeypatch.setattr(
         "advsearch.questions.attack.studies.curve", lambda asked: samples.curve(run=str(asked.run.path))
     )
-    assert carry_out(AttackConfig(**several, run=run)) == samples.curve(run=run)
+    assert run_experiment(AttackConfig(**several, run=run)) == samples.curve(run=run)
 
 
 def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConfig]) -> None:
-    summary = carried_out(curve, Asked(AttackConfig(object="mug,pan", run="study")))
+    summary = run_and_save(curve, RunContext(AttackConfig(object="mug,pan", run="study")))
     assert [row.ending for row in summary.table] == ["found", "budget spent"]
     assert [one.robust for one in summary.curve] == [1] and len(asked) == 2
 
@@ -121,10 +121,10 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
 
     monkeypatch.setattr(attacking, "attack_once", stopped)
     with pytest.raises(KeyboardInterrupt):
-        gap.from_config(config)
+        gap.run(config)
     assert Path("runs/study/parts/00-00-mug-texture/summary.json").is_file()
     monkeypatch.setattr(attacking, "attack_once", carry_out)
-    summary = gap.from_config(config, resumed=Path("runs/study"))
+    summary = gap.run(config, resumed=Path("runs/study"))
     assert [(row.object, row.control) for row in summary.table] == [
         ("mug", "texture"), ("mug", "geometry"), ("bowl", "texture"), ("bowl", "geometry"),
     ]  # fmt: skip
@@ -134,12 +134,12 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
 
 def test_a_gap_gives_each_control_its_own_budget(asked: list[AttackConfig]) -> None:
     config = GapConfig(object="mug", controls="texture,pose", epsilon="texture=0.05", run="study", average=7)
-    gap.from_config(config)
+    gap.run(config)
     assert [(one.epsilon, one.average, list(one.controls)) for one in asked] == [
         ({"texture": 0.05}, 7, ["texture"]), (None, 7, ["pose"]),
     ]  # fmt: skip
     with pytest.raises(InputError, match="epsilon: several make a curve"):
-        gap.from_config(GapConfig(object="mug", epsilon="0.1,0.2", run="other"))
+        gap.run(GapConfig(object="mug", epsilon="0.1,0.2", run="other"))
 
 
 # ---- rendered -------------------------------------------------------------------------------------------------------
@@ -154,7 +154,7 @@ def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path, monkeyp
         vary="pose.yaw,camera.elevation", samples=8, map=2, verify_spp=2, run=str(tmp_path / "run"),
     )  # fmt: skip
     try:
-        result = region.from_config(config)
+        result = region.run(config)
     except InputError as error:  # sixteen pixels may leave the verdict to the noise, which is said
         assert "depends on the noise" in str(error)
         return
@@ -200,7 +200,7 @@ def test_a_region_that_is_interrupted_says_how_to_go_on(
 )
 def test_a_region_refuses_what_does_not_fit(more: dict[str, Any], error: Any, message: str, tmp_path: Path) -> None:
     with pytest.raises(error, match=message):
-        region.from_config(RegionConfig(**{**SMALL, "controls": "pose", **more, "run": str(tmp_path / "run")}))
+        region.run(RegionConfig(**{**SMALL, "controls": "pose", **more, "run": str(tmp_path / "run")}))
     assert not (tmp_path / "run").exists()
 
 

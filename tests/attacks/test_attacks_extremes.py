@@ -36,7 +36,7 @@ from advsearch.files import JsonObject
 from advsearch.models import load_model
 from advsearch.models.model import Model, Preprocessing
 from advsearch.questions.stability.scenes import condition_number, hessian
-from advsearch.scene.assets import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.formation import to_8_bit
 from advsearch.tasks import Classification, Judgement, Prediction
 

@@ -26,7 +26,7 @@ from advsearch import __version__
 from advsearch.cli import doctor
 from advsearch.cli import show as names
 from advsearch.cli.flags import with_flags
-from advsearch.cli.main import COMMANDS, help_of, main
+from advsearch.cli.main import get_command_help, list_commands, main
 from advsearch.cli.output import aligned, finish
 from advsearch.cli.output import shown_text as text_of
 from advsearch.controls.base import Choice
@@ -60,12 +60,12 @@ def noting(given: list[Any], answer: Any) -> Api:
 
 @pytest.fixture
 def api(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Put a stand-in in the place of `advsearch.question.carry_out`."""
+    """Put a stand-in in the place of `advsearch.experiment.run_experiment`."""
 
     def not_wanted(config: Config, **named: Any) -> Any:
         raise AssertionError(f"the command line asked for {config.command}")
 
-    return lambda answering=not_wanted: monkeypatch.setattr("advsearch.question.carry_out", answering)
+    return lambda answering=not_wanted: monkeypatch.setattr("advsearch.experiment.run_experiment", answering)
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
         after = resource.getrusage(resource.RUSAGE_CHILDREN)  # CPU seconds: what others do on the machine takes none
         seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     assert (done.returncode, done.stderr) == (0, "[]\n")
-    assert all(name in done.stdout for name in COMMANDS)
+    assert all(name in done.stdout for name in list_commands())
     assert min(seconds) < 0.5
 
 
@@ -115,12 +115,12 @@ def test_help_has_four_groups_and_each_command_once_with_its_whole_help(
     groups = listing.split("\n\n")
     assert [group.partition(": ")[0] for group in groups[1:]] == ["look", "trust", "files and runs"]
     shown = re.findall(r"^  ([a-z0-9-]+) +(.+(?:\n {4,}.*)*)", listing, re.M)
-    assert [name for name, _ in shown] == list(COMMANDS)
+    assert [name for name, _ in shown] == list_commands()
     for name, text in shown:
-        assert " ".join(text.split()) == help_of(name)
+        assert " ".join(text.split()) == get_command_help(name)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", list_commands())
 def test_every_command_has_help_and_json(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
     out, err = capsys.readouterr()
@@ -151,7 +151,7 @@ def test_no_command_prints_help_and_version_is_told(capsys: pytest.CaptureFixtur
         (["atack"], "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, "),
         (["--jsn"], "unknown flag '--jsn'."),
         (["attack", "--epsilom", "1"], "unknown flag '--epsilom'. Did you mean '--epsilon'"),
-        (["attack", "--eps", "1"], "advsearch attack has no --eps; did you mean --epsilon?"),
+        (["attack", "--eps", "1"], "unknown flag '--eps'. Did you mean '--epsilon'?"),
         (["region", "--workers", "2"], "advsearch region has no --workers, a flag of advsearch attack, sweep"),
         (["attack", "mug"], "expected flags, got 'mug'; for the object write --object mug; see advsearch attack -"),
         (["attack", "--steps"], "argument --steps: expected one argument; see advsearch attack --help"),
@@ -211,9 +211,9 @@ def test_a_message_names_the_argument_in_python_and_the_flag_on_the_command_line
 
 def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
     code = (
-        "import sys, advsearch.question\n"
+        "import sys, advsearch.experiment\n"
         "def carry_out(config, *, progress, resumed): raise ValueError('a bug')\n"
-        "advsearch.question.carry_out = carry_out\n"
+        "advsearch.experiment.run_experiment = carry_out\n"
         "from advsearch.cli.main import main; sys.exit(main(['attack', '--object', 'mug', '--json']))"
     )
     path = os.pathsep.join(map(str, (ROOT, ROOT / "tests")))
@@ -242,9 +242,12 @@ def test_what_the_api_raises_becomes_a_status(
 
 
 @pytest.mark.parametrize(("ending", "status"), [("interrupted", 130), ("found", 0), ("budget spent", 0)])
-def test_a_result_of_a_run_that_was_stopped_has_the_status_of_an_interrupt(ending: str, status: int) -> None:
+def test_a_result_of_a_run_that_was_stopped_has_the_status_of_an_interrupt(
+    ending: str, status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     result: Any = types.SimpleNamespace(ending=ending, run=None)
-    assert finish(result, lambda _: "the answer", as_json=False) == status
+    monkeypatch.setattr("advsearch.cli.output.shown_text", lambda result: "the result")
+    assert finish(result, as_json=False) == status
 
 
 SWALLOWING = """
@@ -275,9 +278,9 @@ class Swallows(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 sys.meta_path.insert(0, Swallows())
 sys.argv[1:] = ["attack", "--object", "mug", "--json", *sys.argv[1:]]
-import advsearch.question
+import advsearch.experiment
 from advsearch.cli.main import main
-advsearch.question.carry_out = carry_out
+advsearch.experiment.run_experiment = carry_out
 sys.exit(main())
 """
 

@@ -11,7 +11,7 @@ import torch
 import advsearch
 from advsearch.controls.background import COLOR, BackgroundControl, hsv_to_rgb
 from advsearch.errors import InputError
-from advsearch.scene.assets import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
 
 

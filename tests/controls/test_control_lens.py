@@ -10,7 +10,7 @@ from torch import Tensor
 
 from advsearch.controls.lens import LensControl, spread, with_dots
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
 
 NAMES = ("x", "y", "radius", "red", "green", "blue", "opacity", "falloff")

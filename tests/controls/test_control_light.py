@@ -12,7 +12,8 @@ from torch import Tensor
 
 from advsearch.controls.light import LIT_POWER, LightControl, metered_irradiance
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import EnvironmentAsset, srgb_to_linear
+from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene

@@ -12,7 +12,8 @@ import torch
 import advsearch
 from advsearch.controls.material import NUMBERS, PATTERNS, SIDE, MaterialControl, covering, tile
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Material, srgb_to_linear
+from advsearch.scene.assets import Material
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.mitsuba_backend.meshes import loadable, principled
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, mesh_translation, translation

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.sensor import SensorControl, aberrated, demosaiced, through_sensor
-from advsearch.scene.assets import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
 
 NAMES = ("vignetting", "aberration", "shot", "read", "mosaic", "red", "blue", "compression")

@@ -12,7 +12,7 @@ from advsearch.controls import make_control, make_space
 from advsearch.controls.base import Control
 from advsearch.controls.texture import TextureControl, palette
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import rasterised

@@ -14,7 +14,7 @@ from hostile import SHORT, shown
 from advsearch import load_scene
 from advsearch.controls import CONTROLS, OWN, Control, TextureControl, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import describe
 from advsearch.scene.gradients import ESTIMATORS
 from advsearch.scene.settings import SETTINGS

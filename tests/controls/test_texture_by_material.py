@@ -25,9 +25,10 @@ from advsearch.engine.transport import remark
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.importing.objects import import_object
+from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.raster import looked_up, texels_of_faces, texels_read
 from advsearch.scene.transport.lights import why_not
-from advsearch.scene.transport.matrix import TOO_LARGE, LinearRenderer
+from advsearch.scene.transport.matrix import LinearRenderer
 
 Box = tuple[Sequence[float], Sequence[float]]
 CAR: dict[str, list[Box]] = {
@@ -409,7 +410,8 @@ def test_what_could_be_done_so_that_steps_are_predicted(
     """Nothing where it would not be enough."""
     reason = why_not(advsearch.load_scene("mug").renderer(controls, resolution=16, **options))
     assert reason is not None and told in remark(reason) and bool(told) == bool(remark(reason))
-    assert remark(f"{TOO_LARGE} 1 GiB").startswith("Each step of the search is rendered, which takes several times")
+    too_large = Refusal("the matrix would take more than 1 GiB", RefusalCause.TOO_LARGE)
+    assert remark(too_large).startswith("Each step of the search is rendered, which takes several times")
 
 
 def test_a_search_that_needlessly_renders_each_step_says_so() -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.engine.problem import BOUND, VIEWS, ComparedView, compared, squares_off, view_of
+from advsearch.engine.acceptance import BOUND, VIEWS, ComparedView, compared, squares_off, view_of
 
 SEARCHES = 400
 

@@ -12,14 +12,14 @@ from stand_ins import Impatient, rows, shared
 
 import advsearch
 from advsearch.attacks.domain import Block, Domain
-from advsearch.engine import bank
-from advsearch.engine import problem as problems
+from advsearch.engine import acceptance, bank
 from advsearch.engine.bank import Bank, stratified
 from advsearch.engine.problem import hard_first
 from advsearch.errors import ClusterError
 from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
+from advsearch.scene.predictor import Refusal
 from advsearch.scene.surface import renderer as surface_renderer
 
 SMALL: dict[str, Any] = {
@@ -54,14 +54,14 @@ def grow(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let it compare every six evaluations, and go on growing after each comparison."""
     for name, value in {"EVERY": 6, "UNSEEN": 2, "SURE": -1e9, "FIRST": 3, "GROWTH": 4}.items():
         monkeypatch.setattr(bank, name, value)
-    monkeypatch.setattr(problems, "CHECK_SPP", 4)
-    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: "matrices are tested")
+    monkeypatch.setattr(acceptance, "CHECK_SPP", 4)
+    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: Refusal("matrices are tested"))
 
 
 @pytest.fixture(autouse=True)
 def by_matrices(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let nothing be predicted by light on surfaces."""
-    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: "matrices are tested")
+    monkeypatch.setattr(surface_renderer, "why_not", lambda renderer, varying: Refusal("matrices are tested"))
 
 
 @pytest.fixture
@@ -189,7 +189,7 @@ def test_a_bank_that_teaches_enough_stops_growing(monkeypatch: pytest.MonkeyPatc
     """Where unseen conditions are no better for the model, there are no more after the first comparison."""
     monkeypatch.setattr(bank, "SURE", 1e9)
     for limit in ("MARGIN", "BOUND"):  # predictions are good enough
-        monkeypatch.setattr(problems, limit, 1e9)
+        monkeypatch.setattr(acceptance, limit, 1e9)
     told = advsearch.attack("mug", **SMALL).summary.transport
     assert told is not None and told.conditions is not None
     assert (told.conditions.made, told.conditions.grown) == (9, 0)

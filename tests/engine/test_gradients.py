@@ -638,7 +638,7 @@ def test_the_smooth_loss_does_not_see_the_edge_of_the_picture() -> None:
 
 def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> None:
     config = CheckConfig(controls={"background": {}}, resolution=(24, 24), spp=4, run=str(tmp_path / "run"))
-    checked = check.from_config(config)
+    checked = check.run(config)
     rows = checked.rows
     linear = [row for row in rows if row.loss == "linear"]
     assert {row.parameter for row in linear} >= {"hue", "saturation", "value"}

@@ -109,7 +109,7 @@ def test_a_sweep_and_a_render_give_every_texture_its_resolution(asked: Any, monk
     monkeypatch.setattr(rendering, "render", rendered)
     config = RenderConfig(object="mug", controls=asked, texture_resolution=16, out="a.png")
     with pytest.raises(InterruptedError, match="16"):
-        rendering.render_from_config(config)
+        rendering.render_picture_file(config)
 
 
 def test_a_gap_gives_each_control_what_it_takes(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
@@ -117,7 +117,7 @@ def test_a_gap_gives_each_control_what_it_takes(monkeypatch: pytest.MonkeyPatch,
 
     monkeypatch.setattr("advsearch.questions.attack.studies.StudyRun.attack", lambda self, one: _seen(one.config, seen))
     config = GapConfig(object="mug", controls="texture,pose,geometry", run=str(tmp_path / "gap"), **ALL)
-    gap.from_config(config)
+    gap.run(config)
     assert seen == [(0.07, "l2", 16), (None, None, None), (0.07, None, None)]
 
 

@@ -15,9 +15,8 @@ from torch import Tensor
 import advsearch
 from advsearch.attacks import make_policy
 from advsearch.attacks.evaluation import Query
-from advsearch.engine import problem as problems
-from advsearch.engine import surface_light
-from advsearch.engine.problem import ComparedView, Deviation
+from advsearch.engine import acceptance, surface_light
+from advsearch.engine.acceptance import ComparedView, Deviation
 from advsearch.engine.surface_light import SurfaceLight
 from advsearch.questions.attack.carry_out import attack_once, parts_of, problem_of_parts
 from advsearch.questions.attack.result import AttackResult
@@ -49,7 +48,7 @@ def coarse() -> Iterator[None]:
         for name, count in {"LIGHTS": 3, "EVERY": 6}.items():
             patched.setattr(surface_light, name, count)
         for name, number in {"CHECK_SPP": 4, "BOUND": 50.0, "MARGIN": 50.0}.items():
-            patched.setattr(problems, name, number)
+            patched.setattr(acceptance, name, number)
         yield
 
 
@@ -122,7 +121,7 @@ def test_a_search_for_a_viewpoint_is_predicted_and_its_ranking_is_traced(viewpoi
     told, renders = viewpoints[1].summary.transport, viewpoints[1].summary.renders
     assert told is not None and (told.way, told.reason, told.conditions) == ("surface light", None, None)
     assert (renders["products"], renders["baseline"]) == (80, 8)
-    assert renders["search"] == 8 + 4 * problems.FIRST * 3
+    assert renders["search"] == 8 + 4 * acceptance.FIRST * 3
     with Store(viewpoints[0] / STORE, read_only=True) as store:
         spp = {(row.phase, row.spp, row.renders) for kind in ("search", "baseline") for row in store.rows(kind)}
     assert spp == {("search", None, 0), ("ranking", 8, 1)}
@@ -164,7 +163,7 @@ def test_a_search_for_a_viewpoint_that_renders_says_why(settings: dict[str, Any]
     """In words; nothing is measured."""
     parts = parts_of(AttackConfig(object="mug", **{**CAMERA, **settings}))
     problem, _ = problem_of_parts(parts)
-    against = surface_light.reason_against(
+    against = surface_light.refusal_of_surface_light(
         problem, problem.steps, make_policy(str(settings.get("policy", "auto"))), True
     )
     assert reason in str(against)
@@ -187,12 +186,12 @@ def test_a_camera_that_was_drawn_is_no_progress_of_the_search(monkeypatch: pytes
         before.append(given[-1])
         return ComparedView(8.0, 9.0, 0.0, 3)
 
-    monkeypatch.setattr(problems, "view_of", view_of)
+    monkeypatch.setattr("advsearch.engine.problem.view_of", view_of)
     light = SurfaceLight(problem, 40)
     light.prepare()
-    assert before == [None] * problems.FIRST
+    assert before == [None] * acceptance.FIRST
     light._compare(problem.domain.sample(torch.Generator().manual_seed(0), 1)[0], 6)
-    assert len(before) == 2 * problems.FIRST and all(one is not None for one in before[problems.FIRST :])
+    assert len(before) == 2 * acceptance.FIRST and all(one is not None for one in before[acceptance.FIRST :])
 
 
 def test_a_random_search_looks_through_the_same_cameras_again() -> None:

@@ -33,7 +33,7 @@ import advsearch
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.domain import NET, Draws, Product, Seeds, batches
 from advsearch.cli.flags import READERS, help_text, with_flags
-from advsearch.cli.main import QuestionCommand, main
+from advsearch.cli.main import ExperimentCommand, main
 from advsearch.cli.output import shown_text as text_of
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
@@ -933,7 +933,7 @@ def test_every_example_of_the_documentation_is_a_sweep(
     monkeypatch.chdir(tmp_path)
     kept_configuration(Path("runs/mug-texture-001"), {"texture": {"resolution": 4}}, [0.5] * 48)
     asked: list[SweepConfig] = []
-    monkeypatch.setattr(QuestionCommand, "carry_out", lambda self, config, **rest: kept(asked, config, 0))
+    monkeypatch.setattr(ExperimentCommand, "run_config", lambda self, config, **rest: kept(asked, config, 0))
     assert main(words[1:]) == 0
     job = job_of(asked[0])
     assert Sweep(job, None, NullProgress()).total > 1

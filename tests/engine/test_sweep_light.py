@@ -11,7 +11,7 @@ from stand_ins import rows
 import advsearch
 from advsearch.attacks.domain import Product
 from advsearch.engine import problem as problems
-from advsearch.engine.problem import Deviation
+from advsearch.engine.acceptance import Deviation
 from advsearch.questions.sweep import predicting
 from advsearch.questions.sweep.job import SweptScene
 from advsearch.questions.sweep.predicting import Groups, combined

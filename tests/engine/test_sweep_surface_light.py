@@ -15,8 +15,8 @@ import advsearch
 from advsearch.attacks.domain import Product
 from advsearch.cluster import Done, Workforce
 from advsearch.engine import problem as problems
+from advsearch.engine.acceptance import Deviation
 from advsearch.engine.journal import worker_call
-from advsearch.engine.problem import Deviation
 from advsearch.progress import NullProgress
 from advsearch.questions.sweep import predicting
 from advsearch.questions.sweep.carry_out import job_of

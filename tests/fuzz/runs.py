@@ -31,7 +31,7 @@ SUMMARY = {
     "verified": {"successes": 5, "trials": 6, "interval": [0.4, 1.0]},
     "seconds": {"total": 3.0},
 }
-SETTINGS = f"{HEADER}schema: 1\ncommand: attack\nobject: mug\ncontrols: {{pose: {{}}}}\n".encode()
+SETTINGS = f"{HEADER}schema: 2\ncommand: attack\nobject: mug\ncontrols: {{pose: {{}}}}\n".encode()
 
 
 @cache

@@ -47,7 +47,7 @@ SMALL: dict[str, Any] = {
 def whole(tmp_path_factory: pytest.TempPathFactory) -> CheckResult:
     """The summary of a check that nobody disturbed."""
     run = tmp_path_factory.mktemp("whole") / "run"
-    return check.from_config(CheckConfig(**SMALL, run=str(run)))
+    return check.run(CheckConfig(**SMALL, run=str(run)))
 
 
 def values(result: Result) -> list[dict[str, Any]]:
@@ -125,10 +125,10 @@ def test_a_summary_never_forgets_what_an_earlier_one_had(
 
     monkeypatch.setattr(RunDirectory, "write_summary", written)
     config, count = CheckConfig(**SMALL, run=str(tmp_path / "run")), len(whole.rows)
-    check.from_config(config)
+    check.run(config)
     assert told == [*range(1, 2 * count + 1), 2 * count]
     told.clear()
-    check.from_config(config, resumed=tmp_path / "run")
+    check.run(config, resumed=tmp_path / "run")
     assert told == [2 * count]
 
 
@@ -137,10 +137,10 @@ def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
 ) -> None:
     folder = tmp_path / "run"
     config = CheckConfig(**SMALL, seconds=0.001, run=str(folder))
-    summary = check.from_config(config)
+    summary = check.run(config)
     assert summary.ending == "out of time" and not finished(folder)
     monkeypatch.setattr(checking, "Results", lambda run, seconds=None: Results(run))  # a sitting that is longer
-    assert values(check.from_config(config, resumed=folder)) == values(whole) and finished(folder)
+    assert values(check.run(config, resumed=folder)) == values(whole) and finished(folder)
     assert main(["show", str(folder)]) == 0
     assert words.READING in capsys.readouterr().out
 
@@ -161,7 +161,7 @@ def test_what_is_stored_is_not_measured_again(tmp_path: Path) -> None:
 def test_a_finished_part_is_not_even_loaded(whole: CheckResult, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checking, "problem_from_config", lambda *_, **__: pytest.fail("loaded"))
     begun = time.process_time()
-    again = check.from_config(CheckConfig(**SMALL, run=whole.run), resumed=Path(str(whole.run)))
+    again = check.run(CheckConfig(**SMALL, run=whole.run), resumed=Path(str(whole.run)))
     assert values(again) == values(whole) and time.process_time() - begun < 20.0
 
 
@@ -229,12 +229,12 @@ def timeless(result: CheckResult) -> dict[str, Any]:
 def test_a_check_that_is_stopped_anywhere_goes_on_to_the_same_plan(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = check.from_config(CheckConfig(**PLANNED, run=str(tmp_path / "whole")))
+    whole = check.run(CheckConfig(**PLANNED, run=str(tmp_path / "whole")))
     assert whole.ending == "done" and finished(tmp_path / "whole")
     assert whole.gains and whole.bounces is not None and whole.plan is not None and whole.plan.left_out
     config, folder, before = CheckConfig(**PLANNED, run=str(tmp_path / "run")), tmp_path / "run", 0
     for number, stop in enumerate((Stop(1), Stop(2), Stop(stage="saves"), Stop(stage="gradients for camera"))):
-        stopped = check.from_config(config, progress=stop, resumed=folder if number else None)
+        stopped = check.run(config, progress=stop, resumed=folder if number else None)
         assert stopped.ending == "interrupted" and not finished(folder)
         assert len(stopped.rows) > before or stopped.bounces is not None
         assert timeless(kept(folder)) == timeless(stopped)
@@ -251,9 +251,9 @@ def test_a_check_that_is_stopped_anywhere_goes_on_to_the_same_plan(
 @pytest.mark.usefixtures("quick")
 def test_a_summary_keeps_its_rows_when_reading_them_back_is_interrupted(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    before = check.from_config(CheckConfig(**PLANNED, run=str(folder)), progress=Stop(3))
+    before = check.run(CheckConfig(**PLANNED, run=str(folder)), progress=Stop(3))
     assert len(before.rows) == 3
-    again = check.from_config(CheckConfig(**PLANNED), progress=Stop(1), resumed=folder)
+    again = check.run(CheckConfig(**PLANNED), progress=Stop(1), resumed=folder)
     assert timeless(again) == timeless(before) == timeless(kept(folder))
 
 
@@ -263,7 +263,7 @@ def test_a_run_that_goes_on_is_not_removed_when_that_fails(tmp_path: Path, monke
     with RunDirectory.create_for(CheckConfig(**SMALL, run=str(folder))):
         pass  # a kill before anything was measured
     with pytest.raises(RuntimeError):
-        check.from_config(CheckConfig(**SMALL), progress=Stop(stage="loading"), resumed=folder)
+        check.run(CheckConfig(**SMALL), progress=Stop(stage="loading"), resumed=folder)
     assert (folder / "run.yaml").is_file()
     with pytest.raises(InputError), RunDirectory.create_for(CheckConfig(**SMALL, run=str(tmp_path / "new"))):
         raise InputError("")

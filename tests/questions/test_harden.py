@@ -17,12 +17,12 @@ from advsearch.attacks import make_policy
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.loading import Scene
-from advsearch.engine.surface_light import reason_against
+from advsearch.engine.surface_light import refusal_of_surface_light
 from advsearch.errors import InputError, ModelError
+from advsearch.experiment import Experiment
 from advsearch.models import Model
 from advsearch.models.reference import Trainable, copied_network, load
 from advsearch.progress import NullProgress
-from advsearch.question import Question
 from advsearch.questions.attack.carry_out import executor_for, problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden import carry_out as hardening
@@ -75,7 +75,7 @@ def test_a_run_trains_measures_and_goes_on(
         taught(self, number, *args)
 
     monkeypatch.setattr(ClassifierCourse, "round", stopped)
-    first = asked.from_config(config)
+    first = asked.run(config)
     assert (first.ending, len(first.rounds), first.after, first.hardened) == ("interrupted", 2, None, None)
     both = [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
     assert attacks == both
@@ -155,8 +155,10 @@ def test_a_measurement_over_viewpoints_may_be_predicted() -> None:
     work = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
     name, scene = work.splits["held out"].scene(0)
     problem = problem_of(work.attack(("camera",), name), scene, work.model)
-    against = [reason_against(problem, steps, make_policy("auto"), True) for steps in (config.steps, QUICK["steps"])]
-    assert against == [None, "light on surfaces pays from 32 pictures on"]
+    against = [
+        refusal_of_surface_light(problem, steps, make_policy("auto"), True) for steps in (config.steps, QUICK["steps"])
+    ]
+    assert against[0] is None and str(against[1]) == "light on surfaces pays from 32 pictures on"
 
 
 @pytest.mark.slow
@@ -238,7 +240,7 @@ def test_what_cannot_be_hardened_is_refused_in_words(
     attacks: list[tuple[str, int | None]], given: dict[str, Any], text: str
 ) -> None:
     with pytest.raises(InputError, match=text):
-        asked.from_config(HardenConfig(**{**SMALL, "labels": "labels.json", **given}))
+        asked.run(HardenConfig(**{**SMALL, "labels": "labels.json", **given}))
     assert not list(Path("runs").glob("*/*"))
 
 
@@ -249,7 +251,7 @@ def test_the_command_asks_what_its_flags_say(monkeypatch: pytest.MonkeyPatch, ca
         given.append(config)
         raise InputError("stop here")
 
-    monkeypatch.setattr(Question, "from_config", lambda self, config, **others: noted(config))
+    monkeypatch.setattr(Experiment, "run", lambda self, config, **others: noted(config))
     flags = "harden --model reference --control texture --epsilon 0.03 --quick --held-out a.glb --json"
     assert main(flags.split()) == 2 and "stop here" in capsys.readouterr().err
     assert given == [HardenConfig(controls={"texture": {}}, epsilon=0.03, quick=True, held_out="a.glb")]

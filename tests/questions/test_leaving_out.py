@@ -171,7 +171,7 @@ def test_a_check_shows_what_is_left_out(specialise: bool, tmp_path: Path) -> Non
         specialise=specialise,
         run=str(tmp_path / "run"),
     )
-    found = check.from_config(config)
+    found = check.run(config)
     said = text_of(found)
     if specialise:
         assert {row.item for row in found.gains} >= {*ITEMS, ALL}

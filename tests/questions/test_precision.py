@@ -594,7 +594,7 @@ def test_a_part_that_is_measured_is_kept_and_not_measured_again(
         threads=1,
         run=str(folder),
     )
-    stopped = precision.from_config(config, progress=Stop("gradient of environment: references"))
+    stopped = precision.run(config, progress=Stop("gradient of environment: references"))
     assert stopped.ending == "interrupted" and {one.quantity for one in stopped.points} == {"picture", "margin"}
     kept = read_result(folder)
     assert kept.to_dict() == stopped.to_dict() and not finished(folder)

@@ -14,9 +14,9 @@ import pytest
 import advsearch
 from advsearch.attacks import clopper_pearson, make_policy
 from advsearch.cli.main import main
-from advsearch.engine.surface_light import reason_against
+from advsearch.engine.surface_light import refusal_of_surface_light
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
-from advsearch.question import carry_out
+from advsearch.experiment import run_experiment
 from advsearch.questions.attack import studies
 from advsearch.questions.attack.carry_out import parts_of, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
@@ -127,7 +127,7 @@ EXAMPLES: dict[str, dict[str, object]] = {
 
 @pytest.mark.parametrize("name", recipe_names())
 @pytest.mark.parametrize("quick", [False, True])
-def test_every_bundled_recipe_is_one_that_can_be_carried_out(name: str, quick: bool) -> None:
+def test_every_bundled_recipe_is_one_that_can_be_run_and_save(name: str, quick: bool) -> None:
     described = read_recipe(name)
     runs = planned(described, RecipeConfig(recipe=name, quick=quick))
     assert runs and len({one.name for one in runs}) == len(runs)
@@ -285,7 +285,7 @@ def test_the_recipe_for_viewpoints_searches_predicted_pictures_and_counts_render
     search, drawn = runs["search"], [runs["all"], runs["worst"]]
     assert isinstance(search, AttackConfig) and search.steps is not None
     problem, _ = problem_of_parts(parts_of(search))
-    assert reason_against(problem, search.steps, make_policy(search.policy_name), search.specialise) is None
+    assert refusal_of_surface_light(problem, search.steps, make_policy(search.policy_name), search.specialise) is None
     assert [isinstance(one, SweepConfig) and one.specialise for one in drawn] == [False, False]
 
 
@@ -323,7 +323,7 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
 ) -> None:
     path, run = tmp_path / "mine.yaml", tmp_path / "run"
     path.write_text(TINY)
-    real, done = carry_out, list[str]()
+    real, done = run_experiment, list[str]()
 
     def stopping(config: Any, **named: Any) -> Any:
         if config.object == "bowl" and not done.count("bowl"):
@@ -336,7 +336,7 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
     with pytest.raises(KeyboardInterrupt):
         advsearch.recipe(path, run=run)
     path.unlink()  # it goes on as it began
-    result = asked.from_config(RecipeConfig.from_yaml(run / "run.yaml"), resumed=run)
+    result = asked.run(RecipeConfig.from_yaml(run / "run.yaml"), resumed=run)
     assert done == ["mug", "bowl", "bowl"]
     assert result.to_dict() == read_result(run).to_dict() and isinstance(read_result(run), RecipeResult)
     assert [one.renders for one in result.parts] == [4, 4] and result.ending == "done"

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from stand_ins import Impatient, rows
 
-from advsearch.engine import problem
-from advsearch.engine import problem as problems
+from advsearch.engine import acceptance, problem
 from advsearch.questions.region import growing, region
 from advsearch.questions.region.result import RegionConfig, RegionResult
 from advsearch.runs.store import NAME as STORE
@@ -29,8 +28,8 @@ def coarse() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(texels, "GROUND", 32)
         for module, name, value in (
-            (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (problems, "CHECK_SPP", 4),
-            (problems, "BOUND", 50.0), (problems, "MARGIN", 50.0), (growing, "MOST_PROBED", 20),
+            (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (acceptance, "CHECK_SPP", 4),
+            (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (growing, "MOST_PROBED", 20),
             (growing, "pays_from", lambda *_: 1),
         ):  # fmt: skip
             patched.setattr(module, name, value)
@@ -41,7 +40,7 @@ def coarse() -> Iterator[None]:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RegionResult]:
     """A run that nobody disturbed, and its result."""
     run = tmp_path_factory.mktemp("region") / "run"
-    return run, region.from_config(RegionConfig(**SMALL, run=str(run)))
+    return run, region.run(RegionConfig(**SMALL, run=str(run)))
 
 
 def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Path, RegionResult]) -> None:
@@ -68,8 +67,8 @@ class Stopping(Impatient):
 def test_a_region_that_goes_on_ends_with_the_same_rows(whole: tuple[Path, RegionResult], tmp_path: Path) -> None:
     """Light is found again; pictures that were predicted are counted as such."""
     config = RegionConfig(**SMALL, run=str(tmp_path / "run"))
-    assert region.from_config(config, progress=Stopping(9)).ending == "interrupted"
-    result = region.from_config(config, resumed=tmp_path / "run")
+    assert region.run(config, progress=Stopping(9)).ending == "interrupted"
+    result = region.run(config, resumed=tmp_path / "run")
     assert rows(tmp_path / "run") == rows(whole[0]) and result.renders == whole[1].renders
 
 
@@ -87,6 +86,6 @@ def test_what_is_rendered_says_why(
     """Nothing is said where that was asked for, or where more moves than a camera."""
     monkeypatch.setattr(growing, "pays_from", lambda *_: 999)
     config = RegionConfig(**{**SMALL, "map": 0, "verify_spp": 2, **more}, run=str(tmp_path / "run"))
-    result = region.from_config(config)
+    result = region.run(config)
     assert "products" not in result.renders
     assert (result.transport and result.transport.reason) == reason

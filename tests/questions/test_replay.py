@@ -87,9 +87,9 @@ def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, m
         return real(*given)
 
     monkeypatch.setattr(Problem, "judge", stopped)
-    first = replay.from_config(config)
+    first = replay.run(config)
     assert first.goes_on and len(first.table) == 1
-    again = replay.from_config(config, resumed=tmp_path / "run")
+    again = replay.run(config, resumed=tmp_path / "run")
     assert again.ending == "done" and len(again.table) == 4 and done == 32 + 4 * 12 - 31
     assert again.table[0] == first.table[0]
 

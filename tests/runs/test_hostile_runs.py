@@ -37,7 +37,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "runs" / "it"
     folder.mkdir(parents=True)
-    (folder / "run.yaml").write_text(f"{HEADER}schema: 1\ncommand: attack\nobject: mug\ncontrols: {{pose: {{}}}}\n")
+    (folder / "run.yaml").write_text(f"{HEADER}schema: 2\ncommand: attack\nobject: mug\ncontrols: {{pose: {{}}}}\n")
     (folder / "summary.json").write_text(json.dumps(SUMMARY))
     with Store(folder / "results.sqlite") as store:
         values: dict[str, Value] = {"pose.yaw": {"value": 3.0, "unit": "degrees"}}

@@ -15,7 +15,7 @@ from advsearch.errors import InputError
 from advsearch.questions.attack import attack
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.runs import directory
+from advsearch.runs import trackers
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Store
 
@@ -133,7 +133,7 @@ def test_a_tracker_that_hangs_does_not_hold_a_run_up(
 ) -> None:
     ended = threading.Event()
     monkeypatch.setattr(sys.modules["mlflow"], "log_metrics", lambda *args, **kwargs: ended.wait(30))
-    monkeypatch.setattr(directory, "PATIENCE", 0.05)
+    monkeypatch.setattr(trackers, "PATIENCE", 0.05)
     run_of(tmp_path / "run", "mlflow")
     assert ("end_run",) not in told
     ended.set()
@@ -143,7 +143,7 @@ def test_a_tracker_that_hangs_does_not_hold_a_run_up(
 def test_one_that_is_not_installed_is_told_before_anything_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    monkeypatch.setitem(sys.modules, directory.PACKAGES[name], None)
+    monkeypatch.setitem(sys.modules, trackers.PACKAGES[name], None)
     with pytest.raises(InputError, match=f"pip install {name}, or leave"):
         run_of(tmp_path / "run", name)
     assert not (tmp_path / "run").exists()
@@ -171,7 +171,7 @@ def test_a_whole_attack_is_told_as_it_is_stored(tmp_path: Path, told: Told, name
         object="mug", controls="pose", policy="random", steps=3, trials=6, verify_spp=16, spp=4, resolution=64,
         denoise="none", baseline=False, log=name, run=str(tmp_path / "run"),
     )  # fmt: skip
-    attack.from_config(config)
+    attack.run(config)
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
         rows = [(row.kind, row.step, row.objective) for row in store.rows()]
     assert [kind for kind, *_ in rows].count("search") > 2

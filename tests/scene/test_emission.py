@@ -20,7 +20,8 @@ from trimesh.visual.material import PBRMaterial
 import advsearch
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assembly import posed
-from advsearch.scene.assets import ObjectAsset, srgb_to_linear
+from advsearch.scene.assets import ObjectAsset
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT, SceneDescription, describe
 from advsearch.scene.formation import EVERYTHING, irradiance
 from advsearch.scene.glb import glb

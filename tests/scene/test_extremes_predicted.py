@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from advsearch.engine.acceptance import ACCEPTED, Deviation, levels_off, view_of
 from advsearch.engine.gradients import smooth_loss
-from advsearch.engine.problem import ACCEPTED, Deviation, levels_off, view_of
 from advsearch.questions.stability.result import Outcome, check, holds
 from advsearch.questions.stability.scene import (
     REFERENCE_SPP,

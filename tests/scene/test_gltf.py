@@ -17,7 +17,8 @@ from PIL import Image, PngImagePlugin
 
 import advsearch
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import EnvironmentAsset, Material, linear_to_srgb, srgb_to_linear
+from advsearch.scene.assets import EnvironmentAsset, Material
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.gltf_parts import EDGES
 from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.parts import ImportedPart

@@ -23,7 +23,8 @@ from trimesh.visual.material import PBRMaterial
 
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene import library, surface_parts
-from advsearch.scene.assets import Material, Mesh, ObjectAsset, linear_to_srgb, srgb_to_linear
+from advsearch.scene.assets import Material, Mesh, ObjectAsset
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import objects
 from advsearch.scene.importing.objects import guess_up, import_object
 from advsearch.scene.importing.pictures import area_average, display_image

@@ -116,7 +116,7 @@ def test_the_picture_is_mitsubas_own(box: Path, shape: str) -> None:
     renderer = scene.renderer("pose", resolution=32, denoise="none")
     ours = renderer(renderer.start, 0, 512).detach()
     box.write_text(BOX.replace("</film>", '<rfilter type="box"/></film>'))
-    from advsearch.scene.assets import linear_to_srgb
+    from advsearch.scene.color import linear_to_srgb
 
     theirs = torch.from_numpy(linear_to_srgb(np.clip(_stock(box), 0.0, 1.0).astype(np.float32)))
     assert float((ours - theirs).abs().mean()) < 0.008

@@ -16,7 +16,7 @@ from PIL import Image
 import advsearch
 from advsearch.engine.loading import Scene
 from advsearch.errors import InputError
-from advsearch.scene.assets import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.mitsuba_backend.meshes import base_texture, repeating
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.scene_files import import_plugins

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.parts import ImportedPart
 

@@ -19,7 +19,7 @@ from torch import Tensor
 import advsearch
 from advsearch.controls.geometry import _Solve
 from advsearch.models.model import recomputed
-from advsearch.scene.assets import LOW_END, linear_to_srgb
+from advsearch.scene.color import LOW_END, linear_to_srgb
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.surface.arrangement import product

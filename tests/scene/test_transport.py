@@ -15,10 +15,9 @@ from stand_ins import Impatient, rows
 from torch import Tensor
 
 import advsearch
-from advsearch.engine import problem
-from advsearch.engine import problem as problems
+from advsearch.engine import acceptance, problem
 from advsearch.engine import transport as searching
-from advsearch.question import Asked, carried_out
+from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
 from advsearch.questions.attack.summary import attack_of
@@ -171,7 +170,8 @@ def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for()
 )
 def test_where_it_can_predict(controls: object, options: dict[str, object], reason: str | None) -> None:
     made = advsearch.load_scene("mug").renderer(controls, resolution=16, **options)  # type: ignore[arg-type]
-    assert lights.why_not(made) == reason
+    refusal = lights.why_not(made)
+    assert (None if refusal is None else refusal.text) == reason
 
 
 def test_a_matrix_that_is_too_large_is_not_made(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,7 +201,7 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(searching, "predicting", counted)
     monkeypatch.setattr(searching.Transport, "likely", guessed)
-    monkeypatch.setattr(problems, "BOUND", 100.0)
+    monkeypatch.setattr(acceptance, "BOUND", 100.0)
     found = advsearch.attack("mug", smallest=True, baseline=False, run=None, **SMALL).summary  # type: ignore[arg-type]
     assert found.smallest is not None and found.smallest.epsilon is not None and found.smallest.searches > 1
     assert made == 1 and guesses >= 5
@@ -219,7 +219,7 @@ def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.Mo
     monkeypatch.setattr(searching, "predicting", counted)
     settings: Any = {**SMALL, "baseline": False, "average": 0, "resolution": (SIZE, SIZE)}
     config = AttackConfig(object="mug", epsilon="0.002,0.004", run=str(tmp_path / "curve"), **settings)
-    found = carried_out(curve, Asked(config))
+    found = run_and_save(curve, RunContext(config))
     assert made == 1 and [one.robust for one in found.curve] == [1, 1]
     alone = advsearch.attack("mug", epsilon=0.004, run=tmp_path / "alone", **settings)
     shared = attack_of(tmp_path / "curve" / "parts" / found.parts[1])
@@ -245,8 +245,8 @@ def test_a_search_says_what_predicted_its_pictures_and_one_that_goes_on_ends_wit
     """It compares, and makes the matrix anew where that is off. What is read back is not predicted again: the matrix
     was made anew once before the interrupt."""
     monkeypatch.setattr(searching, "EVERY", 6)
-    monkeypatch.setattr(problems, "MARGIN", 0.0)
-    monkeypatch.setattr(problems, "OF_MOVED", 0.0)
+    monkeypatch.setattr(acceptance, "MARGIN", 0.0)
+    monkeypatch.setattr(acceptance, "OF_MOVED", 0.0)
     settings: Any = {**SMALL, "baseline": False, "deterministic": True}
     found = advsearch.attack("mug", run=tmp_path / "whole", **settings)
     told, renders = found.summary.transport, found.summary.renders

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.glb import GlbBuffer
 from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.parts import ImportedPart

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from advsearch.scene.assets import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.mtl_surfaces import map_of
 from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.parts import ImportedPart

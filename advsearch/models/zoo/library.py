@@ -24,7 +24,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from advsearch.errors import ModelError
+from advsearch.errors import CodeNotAllowedError, ModelError
 from advsearch.models.model import Triple, warn
 from advsearch.models.probe import first_line
 from advsearch.models.source import Purpose, Source, source_of
@@ -103,7 +103,7 @@ def reading(spec: str, advice: str) -> Iterator[None]:
         raise
     except Exception as error:  # a library raises nearly anything for what is not there or damaged
         if tries:
-            raise ModelError(
+            raise CodeNotAllowedError(
                 f"a file names the model {spec}, which is not on this machine and would be fetched; "
                 f"{how_to_allow(spec)}"
             ) from error

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from advsearch.question import Asked, question
-from advsearch.questions.attack.display import claims as claims
-from advsearch.questions.attack.display import shown as shown
-from advsearch.questions.attack.page import page as page
+from advsearch.experiment import RunContext, experiment
+from advsearch.questions.attack.display import claims, shown
+from advsearch.questions.attack.page import page
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import BY_FIELD as BY_FIELD
-from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
+from advsearch.questions.attack.summary import BY_FIELD, AttackSummary, CurveResult, MatrixResult
 
 
-@question(
+@experiment(
     "attack --object mug --control texture",
     "attack --object mug --control texture --epsilon 0.03 --set camera.azimuth=130 --seed 1",
     "attack --object mug --model reference,torchvision:resnet18 --label mug,cup",
-    called="advsearch.questions.attack.carry_out:attack",
+    python_function="advsearch.questions.attack.carry_out:attack",
+    view=shown,
+    claims=claims,
+    page=page,
+    other_results=BY_FIELD,
 )
-def attack(asked: Asked[AttackConfig]) -> AttackSummary | CurveResult | MatrixResult:
+def attack(asked: RunContext[AttackConfig]) -> AttackSummary | CurveResult | MatrixResult:
     """Find the worst configuration of a scene, and verify it with fresh renders; or do so for several."""
     # imports torch
     from advsearch.questions.attack.carry_out import attack_once

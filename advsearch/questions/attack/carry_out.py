@@ -33,7 +33,7 @@ from advsearch.engine.loading import SCENE, Controls, Scene, framed
 from advsearch.engine.naming import AnyModel, load_models, model_name, several
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
-from advsearch.engine.transport import CleanMatrix, reason_against
+from advsearch.engine.transport import CleanMatrix, refusal_of_matrices
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
@@ -41,23 +41,23 @@ from advsearch.models.address import AskedModel
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Watched, watcher
 from advsearch.questions.attack import settings as numbers
+from advsearch.questions.attack.ambient import problems_by_key
 from advsearch.questions.attack.outcome import summarise
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.stages import Attack, problems_by_name
+from advsearch.questions.attack.stages import Attack
 from advsearch.report.wording import count
-from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, run_path
-from advsearch.runs.directory import only_here as only_python_has
+from advsearch.runs.directory import CONFIG, RunDirectory, begun, check_free, is_run, read_python_only, run_path
 from advsearch.scene.formation import EVERYTHING, NOTHING, aovs_of, next_count
 from advsearch.scene.things import ALL
-from advsearch.settings import FILES
+from advsearch.settings import FILES, PythonOnly
 from advsearch.tasks import AnyTask, Facts, OwnTask, Task, function_of, make_task
 from advsearch.tasks.together import Together, each_thing, together
 
 LOADING, PREPARING = "loading the scene and the model", "preparing the scene for rendering"
 """What a person who waits is told before the first picture."""
-SEARCHED_WITH = ("the objective", "the policy", "the metric")
-"""How the parts of a run begin that say nothing of whether its result is right."""
+ROLES_IN_SEARCH = frozenset({"objective", "policy", "metric"})
+"""Roles of parts that decide how a scene was found, and not whether its result is right."""
 
 
 def attack_once(
@@ -116,7 +116,7 @@ def carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None =
 def attack_worker(settings: JsonObject) -> Call:
     """Return what evaluates the queries of the attack that the settings describe: what a worker does."""
     problem = problem_on(parts_of(AttackConfig(**settings)))
-    return worker_call(problems_by_name(problem))
+    return worker_call(problems_by_key(problem))
 
 
 def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:
@@ -175,7 +175,7 @@ def parts_of(config: AttackConfig, scene: Scene | None = None, model: Model | No
 
 def parts_in(run: Path) -> AttackParts:
     """Find and load everything that the run of an attack was asked with, as its result is judged."""
-    if needed := [part for part in only_python_has(run) if not part.startswith(SEARCHED_WITH)]:
+    if needed := [part.text for part in read_python_only(run) if part.role not in ROLES_IN_SEARCH]:
         raise InputError(f"{run}: {', '.join(needed)}: only the Python session that asked has what judges its result")
     return parts_of(judged_alone(AttackConfig.from_yaml(run / CONFIG)))
 
@@ -288,7 +288,7 @@ def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
     if problem.conditions is None:
         return config.steps or numbers.STEPS, 1
     usual = numbers.OVER_ONE if problem.conditions.dim == 1 else numbers.OVER_PREDICTED
-    if reason_against(problem, config.steps or usual[0], config.specialise) is not None:  # they are rendered
+    if refusal_of_matrices(problem, config.steps or usual[0], config.specialise) is not None:  # they are rendered
         boxes = all(block.norm == "box" for block in problem.domain.blocks)
         usual = numbers.OVER_NUMBERS if boxes else numbers.OVER_RENDERED
     steps, draws = usual
@@ -417,13 +417,15 @@ def attack(
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     losses.check_aim(objective, targeted=config.target is not None)
-    parts = [f"the model {model_name(network)}" for network in several(model) if naming.exists_here(network)]
-    parts += ["the scene"] if scene.only_here else []
-    parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
-    parts += [f"the objective {config.objective}"] if callable(objective) else []
-    parts += [f"the policy {policy.name}"] if isinstance(policy, Policy) and not is_named(policy, policy_of) else []
-    parts += [f"the control {name}" for name in own_controls]
-    parts += [f"the metric {name}" for name in judging.only_here(config.metrics)]
+    parts = [PythonOnly("model", model_name(network)) for network in several(model) if naming.exists_here(network)]
+    parts += [PythonOnly("scene")] if scene.only_here else []
+    parts += [PythonOnly("task", task.name)] if isinstance(task, Task) and not is_named(task, make_task) else []
+    parts += [PythonOnly("objective", config.objective)] if callable(objective) else []
+    parts += (
+        [PythonOnly("policy", policy.name)] if isinstance(policy, Policy) and not is_named(policy, policy_of) else []
+    )
+    parts += [PythonOnly("control", name) for name in own_controls]
+    parts += [PythonOnly("metric", name) for name in judging.only_here(config.metrics)]
     if config.workers is not None or config.cluster is not None:
         judging.check_shared(config.metrics)
     config = config.with_only_here(parts)

@@ -286,9 +286,10 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
 def transport_of(findings: Findings) -> LinearTransport:
     """Return what predicted the pictures of the searches, and how far it was off; or why nothing did."""
     if findings.transport is None:
-        return LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")
+        return LinearTransport(used=False, reason=str(findings.rendered_because or "nothing was searched"))
     predicted = findings.transport.summary()
-    return predicted.model_copy(update={"reason": predicted.reason or findings.surface_refused or None})
+    surface_refused = str(findings.surface_refused) if findings.surface_refused else None
+    return predicted.model_copy(update={"reason": predicted.reason or surface_refused})
 
 
 def _renders(findings: Findings, problem: Problem) -> dict[str, int]:

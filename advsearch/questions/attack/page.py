@@ -29,7 +29,7 @@ from advsearch.viewer.pages import object_data, object_part, read_object, shown_
 FRAME_QUALITY = 85  # Of the JPEG frames of the search, from 1 to 95
 MOST_TRIALS = 24  # Pictures of the verification that the page shows
 AT_THE_END = 1e-6  # Of a range: as near as that to one of its ends a value was stopped by it
-MARKED, FORMERLY_MARKED = "-prediction.png", "-answer.png"
+MARKED = "-prediction.png"
 """How files with marks end, and how those of runs that were made before do."""
 
 
@@ -97,12 +97,11 @@ def _pictures(run: Path, summary: AttackSummary, *, animated: bool) -> Iterator[
     yield ResultPart("What the model sees", pictures=[seen], note=note)
     yield ResultPart(live="compare")
     kept = run / directory.IMAGES
-    ends = MARKED if (kept / f"clean{MARKED}").is_file() else FORMERLY_MARKED
-    if (kept / f"clean{ends}").is_file():
+    if (kept / f"clean{MARKED}").is_file():
         marks = words.marks_text(summary.task)
-        yield ResultPart("What it predicts", pictures=[pair(ends)], layout="large", note=marks)
+        yield ResultPart("What it predicts", pictures=[pair(MARKED)], layout="large", note=marks)
     trials = sorted(file.name for file in kept.glob("verification*.png"))
-    trials = ([name for name in trials if name.endswith(ends)] or trials)[:MOST_TRIALS]
+    trials = ([name for name in trials if name.endswith(MARKED)] or trials)[:MOST_TRIALS]
     if small := [Picture(f"images/{name}", f"trial {''.join(filter(str.isdigit, name))}") for name in trials]:
         yield ResultPart("Pictures of the verification", pictures=[small], layout="small", folded=True)
     if animated:

@@ -49,7 +49,7 @@ class AttackConfig(DerivativeConfig):
         Clash("minimise", lambda asked: asked.smallest, "has no smallest change; leave `smallest` out"),
         Clash("over", lambda asked: {*map(instance, asked.over)} & {*map(instance, asked.controls)},
               "names a control that is searched already; leave it out of one of the two"),
-        Clash("draws", lambda asked: not asked.over and asked.draws != OVER_RENDERED[1],  # as older runs
+        Clash("draws", lambda asked: not asked.over,
               "is how many conditions of `over` a step looks at, and there are none; add `over`, or leave `draws` out"),
         Clash("estimators",
               lambda asked: (

@@ -4,9 +4,9 @@ smallest change that flips the prediction, searches and trials take turns, withi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -25,88 +25,27 @@ from advsearch.attacks import (
     planned_renders,
     run_trials,
     search,
-    verify,
 )
 from advsearch.attacks.candidates import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, scaled, smallest
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
-from advsearch.controls.projector import ProjectorControl
 from advsearch.engine import planning, surface_light
 from advsearch.engine.bank import Bank
 from advsearch.engine.gradients import Bench, inside
-from advsearch.engine.journal import PLAN, Journal, Shared, finite, other_numbers, same
+from advsearch.engine.journal import PLAN, Journal, finite, other_numbers, same
 from advsearch.engine.judging import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.surface_light import SurfaceLight
-from advsearch.engine.transport import CleanMatrix, PredictedSearch, Transport, reason_against, remark
+from advsearch.engine.transport import CleanMatrix, PredictedSearch, Transport, refusal_of_matrices, remark
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.interrupts import interruptible
+from advsearch.questions.attack.ambient import find_ambient
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.wording import count
+from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.transport.matrix import TransportTooLargeError
 from advsearch.tasks import Judgement
-
-# ---------------------------------------------------------------------------------------------------------------------
-# In how much ambient light the picture of a projector still works: tried with fresh seeds in ever more of it.
-
-BRIGHTEST = 1e5  # Lux of direct sun: nothing is tried beyond
-IN_LIGHT = "ambient x "
-"""What the names of problems for workers begin with, before how many times the ambient light they have."""
-HALVED = 2
-"""How often the step between the last ambient light in which it holds and the first in which it does not is halved: to
-a factor of 1.19."""
-
-
-def find_ambient(verifier: Verifier, u: Tensor) -> None:
-    """Try a verified configuration (d,) in twice the ambient light, and twice that, until it no longer holds.
-
-    Nothing else changes: exposure follows the ambient light, so that the projector is the darker one. All points have
-    the same seeds, which nothing else has. What comes of it is in `verifier.findings`.
-    """
-    problem, findings = verifier.problem, verifier.findings
-    projectors = [bound for bound in problem.searched_space.controls if isinstance(bound, ProjectorControl)]
-    own = projectors[0].ambient if projectors else None  # and None where they are searched too
-    if own is None or findings.verification is None:
-        return
-    tried = findings.ambient
-    tried[own] = findings.verification
-
-    def holds(lux: float) -> bool:
-        title = f"trying it in ambient light of {lux:.3g} lux"
-        verifier.begin(title, 2 * verifier.count, name="ambient", at_most=True)
-        shared = verifier.journal.traced
-        there = Shared(in_light(problem, lux / own), shared.executor, f"{IN_LIGHT}{lux / own!r}")
-        journal = replace(verifier.journal, traced=there)
-        tried[lux] = verify(
-            replace(verifier, journal=journal).evaluate_all, problem.domain, u, claim=Ending.FOUND, spp=findings.spp,
-            seed=seeds.stream(problem.seed, "ambient"), trials=verifier.looks, rule=problem.rule,
-            kind=f"ambient {lux:.6g} lux", control=f"control {lux:.6g} lux",
-        )  # fmt: skip
-        return tried[lux].ending is Ending.FOUND
-
-    good, bad = own, 2.0 * own
-    while bad <= BRIGHTEST and holds(bad):
-        good, bad = bad, 2.0 * bad
-    for _ in range(HALVED if bad in tried else 0):
-        between = (good * bad) ** 0.5
-        good, bad = (between, bad) if holds(between) else (good, between)
-
-
-def problems_by_name(problem: Problem) -> Callable[[str], Problem]:
-    """Return what gives a worker the problem of a query by its name: that of the run, or the same in other light."""
-    lit = lru_cache(maxsize=2)(partial(in_light, problem))
-    return lambda name: lit(float(name.removeprefix(IN_LIGHT))) if name.startswith(IN_LIGHT) else problem
-
-
-def in_light(problem: Problem, times: float) -> Problem:
-    controls = [
-        bound.in_light(times) if isinstance(bound, ProjectorControl) else bound for bound in problem.space.controls
-    ]
-    space, renderer = replace(problem.space, controls=tuple(controls)), problem.renderer.like()
-    renderer.space = space
-    return replace(problem, space=space, renderer=renderer)
-
 
 MOST_FRAMES = 60
 UNPRINTED = "search without print terms"
@@ -164,7 +103,7 @@ class Attack:
             problem.spp, problem.search_depth = stored["spp"], stored.get("search_depth")
             return
         worth = config.specialise and (config.measure == "full" or problem.steps >= planning.WORTH_BOUNCES)
-        against = surface_light.reason_against(problem, problem.steps, self.policy, config.specialise)
+        against = surface_light.refusal_of_surface_light(problem, problem.steps, self.policy, config.specialise)
         if worth and against is not None:  # else no step will be rendered
             title, most = "finding how many bounces of light the search needs", planning.most_pictures(problem)
             hint = "few samples each; `specialise=false` leaves it out"
@@ -180,7 +119,7 @@ class Attack:
         full = config.measure == "full"
         if config.measure == "no" or not self.policy.uses_gradient:
             return
-        if not full and reason_against(problem, problem.steps, config.specialise) is None:
+        if not full and refusal_of_matrices(problem, problem.steps, config.specialise) is None:
             return  # derivatives will come from what predicts the pictures
         renderer, counted = problem.renderer, not full or config.deterministic
         seed = seeds.stream(problem.seed, "measure")
@@ -292,8 +231,8 @@ class Attack:
     def collect_transport(self) -> None:
         problem, steps, findings = self.problem, self.problem.steps, self.findings
         specialise = self.config.specialise
-        matrix = reason_against(problem, steps, specialise)
-        surface = surface_light.reason_against(problem, steps, self.policy, specialise)
+        matrix = refusal_of_matrices(problem, steps, specialise)
+        surface = surface_light.refusal_of_surface_light(problem, steps, self.policy, specialise)
         if matrix is None and problem.conditions is None:
             self._prepare(Transport(problem, steps, clean=self.clean), "collecting light transport")
             return
@@ -309,8 +248,9 @@ class Attack:
         if matrix is None:
             self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
             return
-        too_short = not findings.surface_refused and not reason_against(problem, 1 << 30, specialise)
-        self._renders_because(matrix if too_short or surface == surface_light.NO_CAMERA else surface)
+        too_short = not findings.surface_refused and refusal_of_matrices(problem, None, specialise) is None
+        is_about_matrices = too_short or surface.cause is RefusalCause.NO_CAMERA
+        self._renders_because(matrix if is_about_matrices else surface)
 
     def _prepare(self, predictor: PredictedSearch, title: str) -> None:
         hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
@@ -320,11 +260,11 @@ class Attack:
             predictor.prepare(self.stages.progress.advance)
         except TransportTooLargeError as error:
             self.findings.transport = None
-            self._renders_because(str(error))
+            self._renders_because(Refusal(str(error), RefusalCause.TOO_LARGE))
 
-    def _renders_because(self, reason: str) -> None:
-        self.findings.rendered_because = reason
-        if text := remark(reason):
+    def _renders_because(self, refusal: Refusal) -> None:
+        self.findings.rendered_because = refusal
+        if text := remark(refusal):
             self.stages.progress.message(text)
 
     def search_all(self) -> None:

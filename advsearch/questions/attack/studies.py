@@ -30,9 +30,9 @@ from advsearch.engine.record import control_group, verified_rate
 from advsearch.engine.transport import CleanMatrix
 from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.errors import ClusterError, FileFormatError
+from advsearch.experiment import Made, RunContext, run_experiment
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
-from advsearch.question import Asked, Made, carry_out
 from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack import summary as results
 from advsearch.questions.attack.settings import AttackConfig
@@ -51,7 +51,7 @@ from advsearch.tasks import make_task
 def carry_out_part(path: Path, config: Config, progress: Progress, ask: Callable[..., Result] | None = None) -> Result:
     """Return the result of the part in the folder `path`; what is done of it is not done again. The configuration is
     what it does, where it has not begun; `ask` carries it out, None as every question is."""
-    ask = ask or carry_out
+    ask = ask or run_experiment
     if not is_run(path) or not (path / CONFIG).is_file():
         return ask(config.model_copy(update={"run": str(path), "overwrite": True}), progress=progress)
     if finished(path):
@@ -166,7 +166,7 @@ class StudyRun:
     After an interrupt nothing more is carried out.
     """
 
-    def __init__(self, asked: Asked[AttackConfig]) -> None:
+    def __init__(self, asked: RunContext[AttackConfig]) -> None:
         self.asked, self.run, self.progress, config = asked, asked.run, asked.progress, asked.config
         self.warnings: list[str] = []
         if config.label is not None and len(config.objects) > 1:
@@ -209,7 +209,7 @@ class StudyRun:
         return self.asked.result(kind, parts=self.names, warnings=self.warnings, **fields)
 
 
-def curve(asked: Asked[AttackConfig]) -> CurveResult:
+def curve(asked: RunContext[AttackConfig]) -> CurveResult:
     """Robust accuracy against epsilon, over objects.
 
     The epsilons are tried from the smallest. An object that flips at one of them flips at every larger one, whose ball
@@ -266,7 +266,7 @@ def _accuracy(rows: Sequence[results.ObjectRow], epsilon: float | None) -> resul
 LEAST_SPP = 64  # Samples a pixel of the trials, where none of the attacks needed more and nothing was asked for
 
 
-def matrix(asked: Asked[AttackConfig]) -> MatrixResult:
+def matrix(asked: RunContext[AttackConfig]) -> MatrixResult:
     """Attack several models, and try every adversarial scene on each of them in pictures that are the same for all.
 
     Trial k has the same seed for every scene and every model, and none that a search or its verification has used.

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from advsearch.question import Asked, question
-from advsearch.questions.check.result import CheckConfig, CheckResult
-from advsearch.questions.check.result import shown as shown
+from advsearch.experiment import RunContext, experiment, fail_check
+from advsearch.questions.check.result import CheckConfig, CheckResult, shown
 
 
-@question(
+@experiment(
     "check --object mug --control pose",
     "check --object mug --control environment.rotation --loss linear --json",
     "check --object mug --control texture,camera --loss model --seconds 120 --run derivatives",
     "check --all --resolution 128 --loss linear --seconds 600 --run gradients",
     "resume gradients",
-    place=("object", "model"),
-    more=". Exit status 3 if a gradient is biased or noisy",
-    short=lambda result: bool(result.falls_short),
+    positional_args=("object", "model"),
+    help_suffix=". Exit status 3 if a gradient is biased or noisy",
+    exit_status=fail_check(lambda result: bool(result.falls_short)),
+    view=shown,
 )
-def check(asked: Asked[CheckConfig]) -> CheckResult:
+def check(asked: RunContext[CheckConfig]) -> CheckResult:
     """Compare every gradient of a scene with differences, and plan a search over it (docs/gradients.md)."""
     from advsearch.questions.check.carry_out import checked  # imports torch
 

@@ -22,8 +22,8 @@ from advsearch.engine.gradients import FACTORS, Bench, Loss, attempts, inside, s
 from advsearch.engine.naming import settings_alone
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Results, taken_rows
+from advsearch.experiment import RunContext
 from advsearch.progress import Progress
-from advsearch.question import Asked
 from advsearch.questions.attack.carry_out import LOADING, problem_from_config
 from advsearch.questions.check.result import CheckConfig, CheckedRow, CheckResult, GainRow, SearchPlan, TexelRow
 from advsearch.runs.results import Measured, PathLength
@@ -45,7 +45,7 @@ Finding = CheckedRow | SearchPlan | PathLength | GainRow | TexelRow
 FINDINGS: TypeAdapter[list[Finding]] = TypeAdapter(list[Finding])
 
 
-def checked(asked: Asked[CheckConfig]) -> CheckResult:
+def checked(asked: RunContext[CheckConfig]) -> CheckResult:
     """Do what is asked, or go on with it. What is measured is stored at once, so that a check that was stopped goes on
     where it was and ends with the same rows; only times differ."""
     progress = asked.progress

@@ -10,10 +10,8 @@ from pydantic import ValidatorFunctionWrapHandler, field_validator, model_valida
 
 from advsearch.config import SceneConfig
 from advsearch.errors import InputError
-from advsearch.question import Asked, question
-from advsearch.questions.compare.result import ComparedPair, ComparedSide, CompareResult
-from advsearch.questions.compare.result import claims as claims
-from advsearch.questions.compare.result import shown as shown
+from advsearch.experiment import PositionalArgument, RunContext, experiment
+from advsearch.questions.compare.result import ComparedPair, ComparedSide, CompareResult, claims, shown
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.results import INTERRUPTED
@@ -85,15 +83,17 @@ class CompareConfig(SweepConfig):
         return SweepConfig.of(self, model=self.compared, trials=0)
 
 
-@question(
+@experiment(
     "compare mug-sweep-001",
     "compare mug-sweep-001 mug-sweep-002 --json",
     "compare reference hardened.pt2 --object mug --control pose,camera --samples 200",
-    place=("compared",),
+    positional_args=("compared",),
     about="compared",
-    expected=("WHAT", "the run of a sweep, or models and what they are shown", "", True),
+    positional=PositionalArgument("WHAT", "the run of a sweep, or models and what they are shown", "", True),
+    view=shown,
+    claims=claims,
 )
-def compare(asked: Asked[CompareConfig]) -> CompareResult:
+def compare(asked: RunContext[CompareConfig]) -> CompareResult:
     """Compare models, objects or adversarial scenes on the same pictures, pair by pair (docs/compare.md).
 
     All other arguments are the settings of `advsearch compare`. The run is kept, in `run` or under runs/. Models that

@@ -21,7 +21,7 @@ import pandas as pd
 from advsearch import seeds
 from advsearch.attacks.trials import paired_by_unit
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.question import Asked
+from advsearch.experiment import RunContext
 from advsearch.questions.compare.result import ComparedPair, CountOf, PairPart, PairPicture, PairRule
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.job import OpenScenes
@@ -248,7 +248,7 @@ def _rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
 class PairPictures:
     """Small pictures of pairs in the folder of the run: those that sweeps kept, or rendered again."""
 
-    asked: Asked[Any]
+    asked: RunContext[Any]
     rendered: int = 0
     warnings: list[str] = field(default_factory=list)
     scenes: dict[str, OpenScenes | None] = field(default_factory=dict)

@@ -7,10 +7,8 @@ from typing import ClassVar
 
 from advsearch.config import SceneConfig
 from advsearch.errors import InputError
-from advsearch.question import Asked, question
-from advsearch.questions.explain.result import ExplainResult, RuleRow
-from advsearch.questions.explain.result import claims as claims
-from advsearch.questions.explain.result import shown as shown
+from advsearch.experiment import PositionalArgument, RunContext, experiment
+from advsearch.questions.explain.result import ExplainResult, RuleRow, claims, shown
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.results import INTERRUPTED
 from advsearch.runs.summary import read_result
@@ -57,15 +55,17 @@ class ExplainConfig(Config):
         return Path(split_names(self.sweeps)[0]).name, self.command
 
 
-@question(
+@experiment(
     "explain mug-sweep-001",
     "explain mug-sweep-001 mug-sweep-002 --confirm 200 --accuracy 0.9",
     "explain mug-sweep-001 --confirm 0 --pairs 0 --json",
-    place=("sweeps",),
+    positional_args=("sweeps",),
     about="sweeps",
-    expected=("RUN", "the run of a sweep", "", True),
+    positional=PositionalArgument("RUN", "the run of a sweep", "", True),
+    view=shown,
+    claims=claims,
 )
-def explain(asked: Asked[ExplainConfig]) -> ExplainResult:
+def explain(asked: RunContext[ExplainConfig]) -> ExplainResult:
     """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
 
     Args:

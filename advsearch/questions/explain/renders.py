@@ -18,11 +18,11 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.controls import CONTROLS, Parameter
 from advsearch.errors import FileFormatError, InputError, ModelError
+from advsearch.experiment import RunContext
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
 from advsearch.options import BY_KEY
 from advsearch.progress import Progress
-from advsearch.question import Asked
 from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.explain.findings import find_clusters, right_of
 from advsearch.questions.explain.result import Confirmation, FailureCluster, FailureClusters, NearestRight
@@ -204,7 +204,7 @@ class Renders:
     """Sweeps in the folder of the run; none any more after an interrupt. `rows` are those of the sweeps that are asked
     about, `table` what varies among them."""
 
-    asked: Asked[Any]
+    asked: RunContext[Any]
     sweeps: Sequence[AskedSweep]
     rows: pd.DataFrame
     table: pd.DataFrame

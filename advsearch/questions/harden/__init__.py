@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
-from advsearch.question import Asked, question
-from advsearch.questions.harden.result import HardenConfig, HardenResult
-from advsearch.questions.harden.result import claims as claims
-from advsearch.questions.harden.result import shown as shown
+from advsearch.experiment import RunContext, experiment
+from advsearch.questions.harden.result import HardenConfig, HardenResult, claims, shown
 
 
-@question(
+@experiment(
     "harden --model reference --control texture --epsilon 0.03 --quick",
     "harden --model mypackage:network@weights.safetensors --labels labels.json --control texture,pose,light",
-    called="advsearch.questions.harden.carry_out:harden",
+    python_function="advsearch.questions.harden.carry_out:harden",
+    view=shown,
+    claims=claims,
 )
-def harden(asked: Asked[HardenConfig], **given: Any) -> HardenResult:
+def harden(asked: RunContext[HardenConfig], **given: Any) -> HardenResult:
     """Train a copy of a model on its worst cases, and prove what it is better at."""
     from advsearch.questions.harden.carry_out import hardened  # imports torch
 

@@ -19,10 +19,10 @@ from advsearch.engine.journal import check_made_of
 from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
 from advsearch.engine.record import Stages
 from advsearch.errors import InputError, ModelError
+from advsearch.experiment import RunContext
 from advsearch.models.reference import trainable
 from advsearch.models.source import split_weights
 from advsearch.progress import Watched, watcher
-from advsearch.question import Asked
 from advsearch.questions.attack.carry_out import LOADING, executor_for
 from advsearch.questions.harden import scenes
 from advsearch.questions.harden.detectors import DetectorCourse, Loss, SegmenterCourse, read_coco
@@ -30,7 +30,7 @@ from advsearch.questions.harden.result import HardenConfig, HardenedControl, Har
 from advsearch.questions.harden.rounds import PICTURES, WEIGHTS, Course, MakeOptimiser, Rounds
 from advsearch.questions.harden.scenes import FURTHER, HELD_OUT, ROBUST, TRAINING, VALIDATION, SceneWork
 from advsearch.questions.harden.training import ClassifierCourse, Examples
-from advsearch.registry import made_question
+from advsearch.registry import get_experiment
 from advsearch.runs.directory import ARTIFACTS, RunDirectory, is_run, run_path
 from advsearch.runs.results import SharedWork
 from advsearch.runs.store import Row
@@ -89,14 +89,12 @@ def harden(
     path = run_path(config.run) if resume and config.run is not None else None
     resumed = path if path is not None and is_run(path) else None
     given = {"model": model, "optimiser": optimiser, "beside": beside, "loss": loss}
-    result: HardenResult = made_question("harden").from_config(
-        config, progress=watcher(progress), resumed=resumed, **given
-    )
+    result: HardenResult = get_experiment("harden").run(config, progress=watcher(progress), resumed=resumed, **given)
     return result
 
 
 def hardened(
-    asked: Asked[HardenConfig],
+    asked: RunContext[HardenConfig],
     *,
     model: AnyModel | None = None,
     optimiser: MakeOptimiser | None = None,
@@ -212,7 +210,7 @@ class Hardening:
         wrong = [[self.wrong.get((f"{which} {control}", number)) for control in controls] for number in numbers]
         return None if any(None in each for each in wrong) else [not any(each) for each in wrong]
 
-    def result(self, asked: Asked[HardenConfig], warnings: list[str]) -> HardenResult:
+    def result(self, asked: RunContext[HardenConfig], warnings: list[str]) -> HardenResult:
         config, done, table = self.config, asked.ending == "done", list[HardenedControl]()
         for control in config.controls:
             shares = {which: _share(self._robust(which, [control])) for which in MEASUREMENTS}

@@ -19,8 +19,8 @@ from advsearch.engine.gradients import Loss, inside, smooth_loss
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Results, taken_rows
 from advsearch.errors import InputError
+from advsearch.experiment import RunContext
 from advsearch.progress import Progress
-from advsearch.question import Asked
 from advsearch.questions.attack.carry_out import LOADING, problem_from_config
 from advsearch.questions.precision import benches
 from advsearch.questions.precision import result as room
@@ -39,7 +39,7 @@ CONFIRM_SHARE, CONFIRM_LEAST, CONFIRM_MOST = 0.4, 4, 64
 count, and at most."""
 
 
-def measured(asked: Asked[PrecisionConfig]) -> PrecisionResult:
+def measured(asked: RunContext[PrecisionConfig]) -> PrecisionResult:
     """Measure error against run time and write figures and numbers.
 
     The picture and the gradient of each control are measured one after the other, each in one sitting, so that their

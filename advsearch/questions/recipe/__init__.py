@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from advsearch.question import Asked, question
-from advsearch.questions.recipe.result import RecipeConfig, RecipeResult
-from advsearch.questions.recipe.result import shown as shown
+from advsearch.experiment import PositionalArgument, RunContext, experiment
+from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, shown
 
 
-@question(
+@experiment(
     "recipe list",
     "recipe backgrounds --quick",
     'recipe backgrounds --object mug.obj --environment a.hdr,b.hdr --model model.pt2 --label "coffee mug,cup"',
     "show recipe backgrounds > mine.yaml",
     "recipe mine.yaml",
-    place=("recipe",),
+    positional_args=("recipe",),
     about="recipe",
-    expected=("NAME", "a recipe, or list", "; list shows the recipes that there are"),
-    listed="advsearch.questions.recipe.description:titles",
+    positional=PositionalArgument("NAME", "a recipe, or list", "; list shows the recipes that there are"),
+    choices="advsearch.questions.recipe.description:titles",
+    view=shown,
 )
-def recipe(asked: Asked[RecipeConfig]) -> RecipeResult:
+def recipe(asked: RunContext[RecipeConfig]) -> RecipeResult:
     """Carry out a recipe: its runs, its figures, and what they say (docs/recipes.md).
 
     Args:

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from advsearch.config import DEFAULT_ENVIRONMENT, SceneConfig, name_in
 from advsearch.controls import CONTROLS
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.question import Asked
+from advsearch.experiment import RunContext
 from advsearch.questions.attack.carry_out import check_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import carry_out_part
@@ -64,7 +64,7 @@ OUTER = ("object", "environment", rates.MODEL, rates.PREDICTION, rates.PART)  # 
 ANY = "*"  # stands for the parameters of a control that does not say beforehand which it has
 
 
-def carried_out(asked: Asked[RecipeConfig]) -> RecipeResult:
+def carried_out(asked: RunContext[RecipeConfig]) -> RecipeResult:
     """Carry out a recipe, but for what is done; what is seen not to work is refused before anything is written."""
     config, resumed, noted = asked.config, asked.resumed, None
     if config.photographs is not None and not Path(config.photographs).is_dir():
@@ -186,7 +186,7 @@ def _photographed(recipe: Recipe, runs: Sequence[PlannedRun]) -> list[PlannedRun
     return [run for run in drawn_anew if isinstance(run.config, SweepConfig) and run.config.keep_pictures == "all"]
 
 
-def _carried_out(runs: Sequence[PlannedRun], asked: Asked[RecipeConfig]) -> tuple[list[DoneRun], list[str]]:
+def _carried_out(runs: Sequence[PlannedRun], asked: RunContext[RecipeConfig]) -> tuple[list[DoneRun], list[str]]:
     """Carry out what is not done, until a run is interrupted; return the runs, and a sentence for each left out."""
     done, left_out, folder = list[DoneRun](), list[str](), asked.run.path / PARTS
     for number, run in enumerate(runs, start=1):

@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.question import Asked, question
+from advsearch.experiment import RunContext, experiment
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.region.result import RegionConfig, RegionResult
-from advsearch.questions.region.result import claims as claims
-from advsearch.questions.region.result import shown as shown
+from advsearch.questions.region.result import RegionConfig, RegionResult, claims, shown
 
 
 def of_the_run(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
@@ -18,14 +16,16 @@ def of_the_run(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
     return RegionConfig.shared(AttackConfig.from_yaml(file))
 
 
-@question(
+@experiment(
     "region --object mug --control pose.yaw,camera.elevation --map 24",
     "region --around mug-pose-001 --vary pose.yaw,pose.pitch",
-    place=("object", "model"),
+    positional_args=("object", "model"),
     about="around",
-    brought=of_the_run,
+    defaults_from_run=of_the_run,
+    view=shown,
+    claims=claims,
 )
-def region(asked: Asked[RegionConfig]) -> RegionResult:
+def region(asked: RunContext[RegionConfig]) -> RegionResult:
     """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md)."""
     from advsearch.questions.region.growing import region_around  # imports torch
 

@@ -19,8 +19,8 @@ from advsearch.engine.record import Stages
 from advsearch.engine.surface_light import LIGHTS, SurfaceLight
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.experiment import RunContext
 from advsearch.options import OUT_OF_VIEW
-from advsearch.question import Asked
 from advsearch.questions.attack.carry_out import LOADING, problem_from_config
 from advsearch.questions.attack.outcome import transport_of
 from advsearch.questions.attack.settings import AttackConfig
@@ -30,6 +30,7 @@ from advsearch.report.figures import MARGIN, axis_title, figure_of, heat
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.summary import read_configuration
+from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, FREE
 from advsearch.settings import split_names
@@ -55,7 +56,7 @@ class Varied:
         return u
 
 
-def region_around(asked: Asked[RegionConfig]) -> RegionResult:
+def region_around(asked: RunContext[RegionConfig]) -> RegionResult:
     config, stages = asked.config, Stages(asked.progress)
     stages.begin("setup", LOADING)
     budget: dict[str, object] = {}
@@ -137,7 +138,7 @@ def _light(verifier: Verifier, config: RegionConfig, varied: Varied) -> SurfaceL
         return None
     reason, least = surface_renderer.why_not_kept(problem.renderer), pays_from(problem.renderer, findings.spp)
     if reason is None and USUAL * len(varied.names) + config.map**2 < least:
-        reason = f"light on surfaces pays from {least} pictures on"
+        reason = Refusal(f"light on surfaces pays from {least} pictures on", RefusalCause.TOO_FEW_STEPS)
     if reason is None:
         stages.begin("transport", "finding the light on surfaces", LIGHTS, hint="`specialise=false` leaves it out")
         light = SurfaceLight(problem, 0, at=varied.centre, places=varied.places)

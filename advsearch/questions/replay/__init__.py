@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from advsearch.question import Asked, question
-from advsearch.questions.replay.result import ReplayConfig, ReplayResult
-from advsearch.questions.replay.result import claims as claims
-from advsearch.questions.replay.result import shown as shown
+from advsearch.experiment import PositionalArgument, RunContext, experiment
+from advsearch.questions.replay.result import ReplayConfig, ReplayResult, claims, shown
 
 
-@question(
+@experiment(
     "replay mug-texture-001",
     "replay mug-texture-001 --ways jpeg,sensor --model torchvision:resnet18 --json",
     about="attack",
-    expected=("RUN", "a run"),
-    called="advsearch.questions.replay.conditions:replay",
+    positional=PositionalArgument("RUN", "a run"),
+    python_function="advsearch.questions.replay.conditions:replay",
+    view=shown,
+    claims=claims,
 )
-def replay(asked: Asked[ReplayConfig]) -> ReplayResult:
+def replay(asked: RunContext[ReplayConfig]) -> ReplayResult:
     """Render the adversarial scene of a run under other conditions, each beside the clean scene."""
     from advsearch.questions.replay.conditions import rendered_again  # imports torch
 

@@ -21,17 +21,18 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import control_group, verified_rate
 from advsearch.engine.verifier import RetrialCondition, Retrials, kept_configuration
 from advsearch.errors import InputError
+from advsearch.experiment import RunContext, run_and_save
 from advsearch.progress import Progress, Watched, watcher
-from advsearch.question import Asked, carried_out
-from advsearch.questions.attack.carry_out import LOADING, SEARCHED_WITH, AttackParts, parts_in, problem_of_parts
+from advsearch.questions.attack.carry_out import LOADING, ROLES_IN_SEARCH, AttackParts, parts_in, problem_of_parts
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.replay.result import NOT_DONE, ReplayConfig, ReplayResult, ReplayRow
-from advsearch.runs.directory import RunDirectory, find_run, only_here
+from advsearch.runs.directory import RunDirectory, find_run, read_python_only
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import MADE_WITH, changed_file
 from advsearch.scene.cycles import BlenderError, Cycles
 from advsearch.scene.renderer import MAX_SPP, Renderer
+from advsearch.settings import PythonOnly
 
 OWN = "as verified"  # The way in which nothing is changed
 OWN_LIGHT = "own"  # What conditions share whose pictures come of the radiance that the run itself would render
@@ -137,18 +138,18 @@ def replay(attack: str | Path | AttackResult, *, progress: Watched = None, **set
     Args:
         attack: one that was kept and has ended: its result, or name or folder of its run.
     """
-    parts, only_now = None, list[str]()
+    parts, only_now = None, list[PythonOnly]()
     if isinstance(attack, AttackResult):
         if attack.run is None:
             raise InputError("attack: expected an attack that was kept, got one that was not; give it a `run`")
-        only_now = [one for one in only_here(attack.run) if not one.startswith(SEARCHED_WITH)]
+        only_now = [part for part in read_python_only(attack.run) if part.role not in ROLES_IN_SEARCH]
         parts = None if attack.parts is None else attack.parts()
     config = configured(ReplayConfig, attack=attack.run if isinstance(attack, AttackResult) else attack, **settings)
-    asked = Asked(config.with_only_here(only_now) if only_now else config, watcher(progress))
-    return carried_out(partial(rendered_again, parts=parts), asked)
+    asked = RunContext(config.with_only_here(only_now) if only_now else config, watcher(progress))
+    return run_and_save(partial(rendered_again, parts=parts), asked)
 
 
-def rendered_again(asked: Asked[ReplayConfig], parts: AttackParts | None = None) -> ReplayResult:
+def rendered_again(asked: RunContext[ReplayConfig], parts: AttackParts | None = None) -> ReplayResult:
     """Render an adversarial scene again as a configuration describes; every trial is stored at once, and a run goes on
     with the next. `parts` is what the attack was asked with; None loads what its run names. Raises InputError where the
     run has no adversarial configuration, or its scene is another one now, and FileFormatError where it did not end, or

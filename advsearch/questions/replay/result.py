@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path, PurePath
 from typing import ClassVar
 
@@ -27,8 +27,6 @@ class ReplayConfig(Config):
 
     command: ClassVar[str] = "replay"
     clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
-
-    formerly: ClassVar[Mapping[str, str]] = {"answer": "attack"}
 
     attack: str = setting(
         ..., "replay", "the run whose adversarial scene is rendered again", "the name or the folder of a run of attack"

@@ -260,7 +260,7 @@ def claims_of(result: Result) -> list[Claim]:
     if result.goes_on:
         state = "is running" if getattr(result, "ending", "") == RUNNING else "is not finished"
         return [nothing_claimed(f"the run {state}" + (f"; so far: {result.brief}" if result.brief else ""))]
-    if claims := registry.part_of(result.command, "claims"):
+    if claims := registry.get_experiment(result.command).claims:
         return list(claims(result)) or [nothing_claimed("nothing in this run came to its end")]
     return [nothing_claimed(f"the command {result.command} does not measure how often a model is right")]
 

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from advsearch.question import Asked, question
-from advsearch.questions.stability.result import StabilityConfig, StabilityResult
-from advsearch.questions.stability.result import shown as shown
+from advsearch.experiment import RunContext, experiment, fail_check
+from advsearch.questions.stability.result import StabilityConfig, StabilityResult, shown
 
 
-@question(
+@experiment(
     "stability",
     "stability --group objective --group stiff",
     "stability --case hdri-texel-100000 --json",
     "stability --seconds 120 --run extremes",
     "resume extremes",
-    more=". Exit status 3 if one falls short",
-    short=lambda result: any(row.status != "ok" for row in result.rows),
+    help_suffix=". Exit status 3 if one falls short",
+    exit_status=fail_check(lambda result: any(row.status != "ok" for row in result.rows)),
+    view=shown,
 )
-def stability(asked: Asked[StabilityConfig]) -> StabilityResult:
+def stability(asked: RunContext[StabilityConfig]) -> StabilityResult:
     """Try stiff and extreme scenes, and say whether each of them holds (docs/stability.md)."""
     from advsearch.questions.stability.scenes import tried_cases  # imports torch
 

@@ -20,7 +20,7 @@ from advsearch.controls.occlusion import sphere
 from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.record import Results, taken_rows
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.question import Asked
+from advsearch.experiment import RunContext
 from advsearch.questions.stability.result import (
     CASES,
     Case,
@@ -382,7 +382,7 @@ for control, name in (("pose", "yaw"), ("camera", "azimuth"), ("environment", "r
 # ---- `stability`: stiff and extreme scenes, and whether each of them holds ------------------------------------------
 
 
-def tried_cases(asked: Asked[StabilityConfig]) -> StabilityResult:
+def tried_cases(asked: RunContext[StabilityConfig]) -> StabilityResult:
     """Run cases of the suite one after the other, until they are done, the time is up or there is an interrupt.
 
     A case that is done is stored at once: a run that was stopped goes on with the case that it was at.

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from advsearch.question import Asked, question
-from advsearch.questions.sweep.display import claims as claims
-from advsearch.questions.sweep.display import shown as shown
-from advsearch.questions.sweep.page import page as page
+from advsearch.experiment import RunContext, experiment
+from advsearch.questions.sweep.display import claims, shown
+from advsearch.questions.sweep.page import page
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 
 
-@question(
+@experiment(
     "sweep --object mug --grid pose.yaw=0:360:24 --grid camera.elevation=5:60:8",
     "sweep --object mug,bowl --environment studio,noon --grid camera.azimuth=0,90,180,270",
     "sweep --object mug --control pose,camera --samples 1000",
     "sweep --object mug --control pose --samples 200 --surface",
     "sweep --adversarial-of mug-texture-001 --control camera,environment --samples 200",
     about="adversarial_of",
-    brought=SweepConfig.of_attack,
-    called="advsearch.questions.sweep.carry_out:sweep",
+    defaults_from_run=SweepConfig.of_attack,
+    python_function="advsearch.questions.sweep.carry_out:sweep",
+    view=shown,
+    claims=claims,
+    page=page,
 )
-def sweep(asked: Asked[SweepConfig]) -> SweepSummary:
+def sweep(asked: RunContext[SweepConfig]) -> SweepSummary:
     """Measure how often the model is right."""
     from advsearch.questions.sweep.carry_out import sweep_from_config  # imports torch
 

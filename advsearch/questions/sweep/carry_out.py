@@ -40,7 +40,7 @@ from advsearch.runs.summary import read_configuration
 from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.formation import aovs_of
 from advsearch.scene.things import ALL
-from advsearch.settings import split_names
+from advsearch.settings import PythonOnly, split_names
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
 from advsearch.tasks.together import each_thing
 
@@ -137,12 +137,12 @@ def sweep(
         names = (",".join(split_names(one)) if isinstance(one, str) else str(one) for one in scenes)
         described["object"] = ",".join(names)
     config = SweepConfig(**{**brought, **described, **options, "run": None if run is None else str(run)})
-    parts = [f"the model {model_name(one)}" for one in networks if naming.exists_here(one)]
-    parts += ["the scene"] if any(place.scene.only_here for place in loaded) else []
-    parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
-    parts += [f"the metric {name}" for name in judging.only_here(config.metrics)]
-    parts += ["the tracker"] if tracker is not None else []
-    config = config.with_only_here([*parts, *(f"the control {name}" for name in loading.only_here(controls))])
+    parts = [PythonOnly("model", model_name(one)) for one in networks if naming.exists_here(one)]
+    parts += [PythonOnly("scene")] if any(place.scene.only_here for place in loaded) else []
+    parts += [PythonOnly("task", task.name)] if isinstance(task, Task) and not is_named(task, make_task) else []
+    parts += [PythonOnly("metric", name) for name in judging.only_here(config.metrics)]
+    parts += [PythonOnly("tracker")] if tracker is not None else []
+    config = config.with_only_here([*parts, *(PythonOnly("control", name) for name in loading.only_here(controls))])
     if config.workers is not None or config.cluster is not None:
         judging.check_shared(config.metrics)
     for name, what in {"keep_pictures": "them", "aov": "the layers", "surface": "the map"}.items():

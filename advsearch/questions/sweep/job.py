@@ -14,10 +14,11 @@ from advsearch import seeds
 from advsearch.attacks import Evaluation, Query, Trials, run_trials
 from advsearch.attacks.domain import Seeds
 from advsearch.controls import Control, Space, make_control, make_space
+from advsearch.engine.image_changes import AWAY, as_claimed, changed
 from advsearch.engine.journal import Journal, Sent, Shared
 from advsearch.engine.judging import Metrics, check_truth, domain_of, facts_of
 from advsearch.engine.loading import Scene, framed, make_renderer
-from advsearch.engine.problem import AWAY, Prepared, Problem, as_claimed, changed
+from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import Stages, rate_of
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError

@@ -16,14 +16,15 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Query
 from advsearch.attacks.domain import Product
-from advsearch.engine.problem import CHECK_SPP, VIEWS, ComparedView, Deviation, Problem, compared, view_of
+from advsearch.engine.acceptance import CHECK_SPP, VIEWS, ComparedView, Deviation, compared, view_of
+from advsearch.engine.problem import Problem
 from advsearch.files import scaled
 from advsearch.questions.sweep.axes import Axis, Points
 from advsearch.runs.results import LinearTransport, PredictionError
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.mitsuba_backend.surface import RAYS
-from advsearch.scene.predictor import MOST_BYTES, NOISE, Predictor
+from advsearch.scene.predictor import MOST_BYTES, NOISE, NOTHING_MOVES, Predictor, Refusal
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP
 from advsearch.scene.surface.renderer import SurfaceRenderer, varied, why_not_kept
@@ -82,8 +83,8 @@ class BasisPictures:
         self._renderer, self._moving = renderer, lighting(renderer)
         self.follows, self.moves = frozenset(self._moving.groups), any(self._moving.groups.values())
 
-    def reason_against(self, fall: Fall, spp: int) -> str | None:
-        """Why pictures of so many samples a pixel are rendered, in words; None if they are predicted."""
+    def find_refusal(self, fall: Fall, spp: int) -> Refusal | None:
+        """Return why pictures of so many samples a pixel are rendered; None if they are predicted."""
         renderer, groups = self._renderer, fall(self.follows)
         if renderer.formation.denoiser != "oidn":
             return NOISE
@@ -91,10 +92,14 @@ class BasisPictures:
         lights = len(Lights(renderer, self._moving, inputs).alone)
         least = math.ceil(PAYS * (lights * SPP + VIEWS * (2 * CHECK_SPP + spp)) / spp)
         if groups.size < least:
-            return f"basis pictures pay where {least} pictures or more differ in light alone; here {groups.size} do"
+            return Refusal(
+                f"basis pictures pay where {least} pictures or more differ in light alone; here {groups.size} do"
+            )
         height, width = renderer.formation.resolution
         if groups.at_once * lights * 8 * height * width > scaled(MOST_BYTES):
-            return f"basis pictures of {groups.count} groups take too much memory; make light the last axes of the grid"
+            return Refusal(
+                f"basis pictures of {groups.count} groups take too much memory; make light the last axes of the grid"
+            )
         return None
 
     def made(self, u: Tensor, seed: int) -> Predictor:
@@ -137,17 +142,21 @@ class LightOnSurfaces:
         """The groups of coordinates that change nothing but these inputs, and the finished picture."""
         return frozenset(name for name, found in self._changes.items() if found <= inputs | ON_PICTURE)
 
-    def reason_against(self, fall: Fall, spp: int) -> str | None:
+    def find_refusal(self, fall: Fall, spp: int) -> Refusal | None:
         groups, arranged = fall(self.follows), fall(self._changing(FREE - {COLOR}))
         self._most_arranged = arranged.at_once
         least = pays_from(self._renderer, spp, arranged.count / groups.count)
         if groups.size < least:
-            return f"light on surfaces pays where {least} pictures differ in the camera alone; here {groups.size} do"
+            return Refusal(
+                f"light on surfaces pays where {least} pictures differ in the camera alone; here {groups.size} do"
+            )
         if (reason := why_not_kept(self._renderer)) is not None:
             return reason
         lit = LIT_BYTES + 4 * self._renderer.scene.base(MAP).numel()
         if arranged.at_once * ARRANGED_BYTES + groups.at_once * lit > scaled(MOST_BYTES):
-            return f"light of {groups.count} groups takes too much memory; make the camera the last axes of the grid"
+            return Refusal(
+                f"light of {groups.count} groups takes too much memory; make the camera the last axes of the grid"
+            )
         return None
 
     def made(self, u: Tensor, seed: int) -> Predictor:
@@ -178,9 +187,11 @@ class SweptPicture:
 
 @dataclass
 class PredictedSweep:
-    """Makes pictures of one scene at one size, as a problem of one of the models has them; `before` it the other scenes
-    have so many. Every picture is rendered for a `reason`, if there is one, which is empty where nothing moves that its
-    way follows, and in groups that are `left` since predictions were too far off."""
+    """Makes pictures of one scene at one size, as a problem of one of the models has them.
+
+    `before` it, the other scenes have so many pictures. Every picture is rendered where there is a `refusal`, and in
+    groups that are `left` since predictions were too far off.
+    """
 
     problem: Problem
     points: Points
@@ -198,20 +209,20 @@ class PredictedSweep:
         """Choose basis pictures where they pay, or light on surfaces."""
         self.renderer = self.problem.renderer
 
-        def reason_against(way: BasisPictures | LightOnSurfaces) -> str | None:
+        def find_refusal(way: BasisPictures | LightOnSurfaces) -> Refusal | None:
             if not way.moves:
-                return ""
+                return NOTHING_MOVES
             if self.renderer.composed or not self.specialise:
-                return self.renderer.composed or "nothing is left out"
-            return way.reason_against(self._fall, self.problem.spp)
+                return Refusal(self.renderer.composed or "nothing is left out")
+            return way.find_refusal(self._fall, self.problem.spp)
 
         self.way: BasisPictures | LightOnSurfaces = BasisPictures(self.renderer)
-        self.reason = reason_against(self.way)
-        if self.reason is not None:
+        self.refusal = find_refusal(self.way)
+        if self.refusal is not None:
             surfaces = LightOnSurfaces(self.renderer, self.seed)
-            reason = reason_against(surfaces)
-            if reason is None or not self.reason:
-                self.way, self.reason = surfaces, reason
+            refusal = find_refusal(surfaces)
+            if refusal is None or self.refusal is NOTHING_MOVES:
+                self.way, self.refusal = surfaces, refusal
         self._groups = self._fall(self.way.follows)
 
     def _fall(self, follows: frozenset[str]) -> Groups:
@@ -225,7 +236,7 @@ class PredictedSweep:
         pictures: dict[int, SweptPicture] = {}
         waiting: dict[Predictor, list[int]] = {}
         for number, query in asked.items():
-            predictor = None if self.reason is not None else self._of(self._groups.group(number), number)
+            predictor = None if self.refusal is not None else self._of(self._groups.group(number), number)
             if predictor is None:
                 picture = self.renderer(query.u, seed=query.seed, spp=self.problem.spp)
                 pictures[number] = SweptPicture(picture, predicted=0, traced=self._spent_on(number) + 1)
@@ -282,8 +293,10 @@ class PredictedSweep:
 
     def summary(self) -> LinearTransport | None:
         """What a result holds of it; None where nothing moves that it follows."""
-        if self.reason is not None:
-            return LinearTransport(used=False, reason=self.reason) if self.reason else None
+        if self.refusal is NOTHING_MOVES:
+            return None
+        if self.refusal is not None:
+            return LinearTransport(used=False, reason=str(self.refusal))
         worst = max(self.deviations, key=lambda one: one.levels) if self.deviations else None
         several = f"{len(self.left)} of {self._groups.count} groups were rendered: predicted pictures were too far off"
         return LinearTransport(

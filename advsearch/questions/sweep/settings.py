@@ -69,7 +69,6 @@ class SweepConfig(SceneConfig):
         SceneConfig, "controls", default=dict, group="sweep",
         description="controls that are drawn at random at each grid point, separated by commas", min_length=None,
     )
-    formerly: ClassVar[Mapping[str, str]] = {"answer_of": "adversarial_of"}
 
     adversarial_of: str | None = setting(
         None, "sweep",

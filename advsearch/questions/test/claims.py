@@ -20,8 +20,9 @@ from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, draws_needed
 from advsearch.config import SceneConfig
+from advsearch.engine.image_changes import AWAY, as_claimed, changed
 from advsearch.engine.journal import Journal, Shared, worker_call
-from advsearch.engine.problem import AWAY, Problem, as_claimed, changed
+from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
 from advsearch.files import JsonObject, JsonValue

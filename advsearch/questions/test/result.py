@@ -99,7 +99,6 @@ def verdict(claims: list[ClaimResult]) -> str:
     return max((claim.answer for claim in claims if not claim.accepted), key=VERDICTS.index, default=HELD)
 
 
-RESULT = SuiteResult
 TABLE_HEADS = ("claim", "verdict", "pictures", "why")
 
 NOTE = (

@@ -109,8 +109,6 @@ class DrawnConfig(SceneConfig):
     )
 
 
-CONFIG = SuiteConfig
-
 OWN = (*PLACE, "seed", "threads", "deterministic", "workers", "cluster", "seconds")
 """Settings that the suite or its command says for all claims."""
 

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Doubles, Floats, Ints, face_vectors, linear_to_srgb, srgb_to_linear
+from advsearch.scene.assets import Doubles, Floats, Ints, face_vectors
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import gltf_entries, gltf_skeleton
 from advsearch.scene.importing.blender import GENERATOR
 from advsearch.scene.importing.files import SPLATS, Notes, check_faces, damaged, shown

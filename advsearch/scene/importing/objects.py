@@ -34,8 +34,8 @@ from advsearch.scene.assets import (
     UpAxis,
     grouped,
     normalised,
-    srgb_to_linear,
 )
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import gltf, gltf_parts
 from advsearch.scene.importing.blender import USD, read_mesh_bytes
 from advsearch.scene.importing.files import Notes, looks_like, safe_name, shown, text_of

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.scene.assets import Bools, Doubles, Floats, Ints, grouped, srgb_to_linear
+from advsearch.scene.assets import Bools, Doubles, Floats, Ints, grouped
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import Notes
 from advsearch.scene.skeleton import Movable
 

@@ -16,7 +16,8 @@ from scipy import sparse
 
 from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS, LARGEST_PIXELS, check_decodable, check_pixels, opened, steps_of
-from advsearch.scene.assets import Floats, linear_to_srgb, srgb_to_linear
+from advsearch.scene.assets import Floats
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import LARGEST_FILE, Notes, References, check_most, plain_name, shown
 
 TEXTURE_LIMIT = 1024  # longest side of an imported texture, in texels; larger ones are averaged down

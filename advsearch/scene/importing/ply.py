@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Doubles, Ints, srgb_to_linear
+from advsearch.scene.assets import Doubles, Ints
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import (
     MOST_CORNERS,
     SPLATS,

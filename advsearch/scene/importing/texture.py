@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
-from advsearch.scene.assets import Doubles, Floats, Ints, grouped, linear_to_srgb, srgb_to_linear
+from advsearch.scene.assets import Doubles, Floats, Ints, grouped
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import Notes
 from advsearch.scene.importing.geometry import Soup, connected, unit_vectors
 from advsearch.scene.importing.parts import FLAT, NEUTRAL, ImportedSurface, texels_of

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from advsearch.pictures import FORMATS, check_decodable
-from advsearch.scene.assets import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 
 Array = npt.NDArray[Any]
 EXR, RADIANCE, PNG = b"\x76\x2f\x31\x01", b"#?", b"\x89PNG"  # how files begin

@@ -22,7 +22,7 @@ from pxr import Ar, Usd, UsdShade
 
 from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.glb import GlbBuffer, mime_type
 from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.gltf_entries import BORDER, CLAMPED, MIRRORED, REPEAT

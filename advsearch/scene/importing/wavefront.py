@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Doubles, Ints, face_vectors, srgb_to_linear
+from advsearch.scene.assets import Doubles, Ints, face_vectors
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import mtl_surfaces
 from advsearch.scene.importing.files import MOST_CORNERS, Notes, References, is_number, numbers_in, shown, text_of
 from advsearch.scene.importing.geometry import cut_up

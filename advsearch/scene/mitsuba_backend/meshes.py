@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Doubles, Floats, Mesh, face_vectors, srgb_to_linear
+from advsearch.scene.assets import Doubles, Floats, Mesh, face_vectors
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.mitsuba_backend.variant import Plugin, mi
 from advsearch.scene.parts import BASE_COLOR, MeshPart
 

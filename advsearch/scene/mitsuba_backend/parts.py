@@ -18,8 +18,8 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.scene import parts
-from advsearch.scene.assets import srgb_to_linear
 from advsearch.scene.camera_model import NUMBERS
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.grounds import paved

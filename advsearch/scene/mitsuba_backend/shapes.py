@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Doubles, Floats, Ints, Mesh, face_vectors, linear_to_srgb
+from advsearch.scene.assets import Doubles, Floats, Ints, Mesh, face_vectors
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.mitsuba_backend.meshes import FACES, NORMALS, POSITIONS, TEXCOORDS, loadable, with_inner
 from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, mi
 from advsearch.scene.parts import BASE_COLOR, HazePart, plugins_in

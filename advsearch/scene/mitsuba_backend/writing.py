@@ -21,7 +21,8 @@ from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene import parts
-from advsearch.scene.assets import Floats, linear_to_srgb
+from advsearch.scene.assets import Floats
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.mitsuba_backend.meshes import base_texture, emitter, matt, own_surface, principled
 from advsearch.scene.mitsuba_backend.parts import CAMERA_NUMBERS, GROUND, color, number, scene_dict, translation

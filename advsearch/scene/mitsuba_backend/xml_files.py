@@ -22,7 +22,7 @@ import numpy as np
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.files import note_opened
-from advsearch.scene.assets import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.files import References, damaged, looks_like, read_bytes, shown
 from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT, banded_average, read_picture

@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles, Floats, Material, linear_to_srgb
+from advsearch.scene.assets import Doubles, Floats, Material
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.places import paint
 from advsearch.scene.places.houses import Fronts

@@ -8,7 +8,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from advsearch.scene.assets import Bools, Doubles, Floats, Material, Mesh, linear_to_srgb
+from advsearch.scene.assets import Bools, Doubles, Floats, Material, Mesh
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
 
 FRONT, SIDES, TOP, BOTTOM = "front", "sides", "top", "bottom"

@@ -22,7 +22,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.assets import Bools, srgb_to_linear
+from advsearch.scene.assets import Bools
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import OBJECT
 from advsearch.scene.grounds import irradiance as unshadowed
 from advsearch.scene.mitsuba_backend.surface import RAYS, Lit, Seen, Views, lit_arrays

@@ -16,7 +16,7 @@ from torch import Tensor
 from advsearch.files import scaled
 from advsearch.scene.description import OBJECT
 from advsearch.scene.mitsuba_backend.surface import RAYS
-from advsearch.scene.predictor import BETWEEN, MOST_BYTES, NOISE, Predictor, differs
+from advsearch.scene.predictor import BETWEEN, MOST_BYTES, NOISE, Predictor, Refusal, RefusalCause, differs
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light, SurfaceView
 
@@ -179,7 +179,7 @@ class SurfaceRenderer(Predictor):
         return look.view.radiance(look.light.reflected(self.arrangement.finer(self.color(inputs)))) * look.factor
 
 
-def why_not(renderer: Renderer, varying: Collection[str]) -> str | None:
+def why_not(renderer: Renderer, varying: Collection[str]) -> Refusal | None:
     """Why light on surfaces cannot predict the pictures of a renderer's space, in words; None if it may: how far it is
     off is then for measurement. Some controls vary; the others are searched, and may change base colours alone."""
     reason = why_not_kept(renderer)
@@ -188,25 +188,25 @@ def why_not(renderer: Renderer, varying: Collection[str]) -> str | None:
     for group in renderer.plan.groups:
         if group.control not in varying and group.estimator != "image":
             if renderer.routes.get(group.name, frozenset()) != {COLOR}:
-                return f"{group.name} changes more than the object's base colour"
+                return Refusal(f"{group.name} changes more than the object's base colour")
     changed = varied(renderer, varying)
     if not changed <= FREE:
-        return f"{', '.join(sorted(changed - FREE))} varies, and light on surfaces is kept for one arrangement"
-    return None if changed & CAMERAS else "no camera varies"
+        return Refusal(f"{', '.join(sorted(changed - FREE))} varies, and light on surfaces is kept for one arrangement")
+    return None if changed & CAMERAS else Refusal("no camera varies", RefusalCause.NO_CAMERA)
 
 
-def why_not_kept(renderer: Renderer) -> str | None:
+def why_not_kept(renderer: Renderer) -> Refusal | None:
     """Why light cannot be kept on the surfaces of a renderer's scene, in words; None if it may be."""
     description = renderer.scene.made[0]
     thing = description.meshes[OBJECT]
     if thing.mesh.repeats or thing.surface is not None:
-        return "the object's surface repeats its texture, or is one of Mitsuba's own"
+        return Refusal("the object's surface repeats its texture, or is one of Mitsuba's own")
     if description.environment is None or description.emits or len(description.parts) > 0:
-        return "there is more in the scene than the object, its ground and an environment"
+        return Refusal("there is more in the scene than the object, its ground and an environment")
     if renderer.scene.volumetric or description.thin_lens or description.backdrop:
-        return "there is haze, a lens with an aperture, or a plain background"
+        return Refusal("there is haze, a lens with an aperture, or a plain background")
     if description.number("camera.drops") > 0.0:
-        return "there are raindrops before the camera"
+        return Refusal("there are raindrops before the camera")
     return None if renderer.formation.denoiser == "oidn" else NOISE
 
 

@@ -24,7 +24,7 @@ from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.geometry import real_harmonics
 from advsearch.scene.gradients import Group
 from advsearch.scene.parts import PATTERN, PluginPart
-from advsearch.scene.predictor import BETWEEN, NOISE, Predictor, differs
+from advsearch.scene.predictor import BETWEEN, NOISE, Predictor, Refusal, RefusalCause, differs
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import SPP, Inputs, LinearRenderer, Tick, linear_inputs, passes, untold
 
@@ -261,10 +261,10 @@ class BasisRenderer(Predictor):
         return torch.cat([radiance, pictures[0][..., 3:]], dim=-1)
 
 
-HAZE = "there is haze"  # A reason that stands alone: without haze, pictures of the same space could be predicted
+HAZE = Refusal("there is haze", RefusalCause.HAZE)
 
 
-def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
+def why_not(renderer: Renderer, varying: Collection[str] = ()) -> Refusal | None:
     """Why pictures of a renderer's space cannot be predicted, in words; None if they can. Controls that vary stand
     still for each matrix, whatever they change; beside them light may not move."""
     plan, linear = renderer.plan, linear_inputs(renderer)
@@ -272,18 +272,18 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     lit = {} if varying else lighting(renderer).groups
     hazes = tuple(f"{part.name}." for part in renderer.scene.made[0].parts if part.volumetric)
     for group in searched:
-        if "forced" in group.reason and group.estimator not in ("none", "image"):
-            return f"the estimator of {group.name} is forced"
+        if group.is_forced and group.estimator not in ("none", "image"):
+            return Refusal(f"the estimator of {group.name} is forced")
         reached = renderer.routes.get(group.name, frozenset())
         of_haze = bool(reached) and all(name.startswith(hazes) for name in reached)
         if group.estimator == "image" or group.name in lit or of_haze:
             continue
         if reached & light_inputs(renderer) and fixed_lights(renderer):
-            return f"{group.name} changes light, and the scene has other lights of its own"
+            return Refusal(f"{group.name} changes light, and the scene has other lights of its own")
         if group.estimator != "adjoint" or not reached <= linear:
-            return f"{group.name} changes more than base colours{'' if varying else ' and light'}"
+            return Refusal(f"{group.name} changes more than base colours{'' if varying else ' and light'}")
     if not any(renderer.routes.get(group.name) or lit.get(group.name) for group in searched):
-        return "nothing that is searched needs a render to be differentiated"
+        return Refusal("nothing that is searched needs a render to be differentiated")
     if renderer.scene.volumetric and not all(group.name in lit for group in searched):
         return HAZE
     return None if renderer.formation.denoiser == "oidn" else NOISE

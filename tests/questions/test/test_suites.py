@@ -27,7 +27,8 @@ from torch import Tensor
 import advsearch
 from advsearch.cli.main import main
 from advsearch.cluster import InProcess
-from advsearch.engine.problem import CHANGED, Problem
+from advsearch.engine.image_changes import CHANGED
+from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import NullProgress
@@ -55,7 +56,7 @@ from advsearch.questions.test.settings import NoWorseClaim, SuiteConfig, suite_o
 from advsearch.runs.listing import listed_run
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
-from advsearch.scene.assets import linear_to_srgb
+from advsearch.scene.color import linear_to_srgb
 from advsearch.settings import Setting, settings
 from advsearch.tasks import Judgement, Prediction
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite

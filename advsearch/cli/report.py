@@ -1,0 +1,137 @@
+"""`advsearch report`: runs as evidence for a model card or a safety case."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from advsearch.cli import output
+from advsearch.cli.main import argument, command
+from advsearch.errors import InputError
+
+NAME = "evidence"
+POSES, LARGEST_POSES = "poses.csv", 1 << 20  # the file that says where photographs were taken, and its most bytes
+
+
+@command(
+    argument("runs", nargs="+", metavar="RUN", help="names or folders of runs; of a recipe, its parts"),
+    argument("--evidence", action="store_true", help="claims with what a reader needs to judge them"),
+    argument("--criterion", metavar="SHARE", type=float, help="share of right predictions that is asked for"),
+    argument(
+        "--exposure",
+        metavar="FILE",
+        help="how common conditions are: YAML such as environment: {street: 0.8, noon: 0.2}",
+    ),
+    argument(
+        "--photographs",
+        metavar="FOLDER",
+        help="photographs aligned with renderings of the first run, by their names: rendering-12.jpg, "
+        "rendering-12-again.jpg; its model judges them, and the run keeps them",
+    ),
+    argument("--by", metavar="NAME", help="who answers for it, as it is to be written", default=""),
+    argument("--out", metavar="FOLDER", help="where the three files go (default: %(default)s)", default=NAME),
+    argument("--overwrite", action="store_true", help="replace what is there"),
+    output.add_code_flag,
+    output.add_flags,
+    more=": a page, Markdown and JSON",
+    examples=(
+        "report mug-texture-001 mug-sweep-001 --evidence",
+        "report mug-texture-001 mug-sweep-001 --evidence --criterion 0.9 --out card --json",
+    ),
+)
+def report(args: argparse.Namespace) -> int:
+    # late, so that --help answers at once
+    from advsearch.questions.report.evidence import collected, read_exposure
+    from advsearch.questions.report.result import evidence_page, markdown
+    from advsearch.runs.files import write_bytes, write_text
+    from advsearch.runs.summary import to_json
+
+    if not args.evidence:
+        raise InputError(
+            "report: expected --evidence, which writes the claims of all these runs; the page of one run is "
+            "report.html in its folder"
+        )
+    folder = Path(args.out)
+    names = [folder / f"{NAME}.{suffix}" for suffix in ("html", "md", "json")]
+    there = [name for name in names if name.exists()]
+    if there and not args.overwrite:
+        raise InputError(f"{there[0]}: exists already; add --overwrite or choose another folder with --out")
+    if args.criterion is not None and not 0.0 < args.criterion <= 1.0:
+        raise InputError(f"--criterion: expected a share over 0 and at most 1, such as 0.9, got {args.criterion:g}")
+    exposure = {} if args.exposure is None else read_exposure(args.exposure)
+    if args.photographs is not None:
+        _take_in(args.photographs, args.runs[0])
+    evidence, pictures = collected(args.runs, criterion=args.criterion, exposure=exposure, by=args.by)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out: cannot make the folder {folder}: {error.strerror}") from None
+    for name, data in pictures.items():
+        write_bytes(folder / name, data)
+    texts = (evidence_page(evidence, pictures), markdown(evidence), to_json(evidence) + "\n")
+    for path, text in zip(names, texts, strict=True):
+        write_text(path, text)
+    lines = [text for run in evidence.runs for text in (run.run, *(f"  {c.kind}: {c.statement}" for c in run.claims))]
+    notes = "".join(f"\nNote: {text}" for text in evidence.warnings)
+    return output.say(args.json, evidence.to_dict(), "\n".join([*lines, notes, *map(str, names)]))
+
+
+def _take_in(folder: str, name: str) -> None:
+    """Have a run's model judge the photographs in a folder that the run does not have yet."""
+    from advsearch.questions.photographs.carry_out import Photographs, photographs_in  # they bring torch
+    from advsearch.runs.directory import CONFIG, find_run
+    from advsearch.settings import read_yaml
+
+    run = find_run(name)
+    task: Any = read_yaml(run / CONFIG).get("task") or "classification"
+    with tempfile.TemporaryDirectory() as named:
+        place = Path(folder)
+        if (place / POSES).is_file():
+            place = _named_by_pose(place, run, Path(named))
+        files = photographs_in(place, task)
+        if loose := [file.name for file in files if not file.stem.startswith("rendering-")]:
+            raise InputError(
+                f"photographs: {loose[0]}: expected the number of a rendering in its name, such as rendering-12.jpg, "
+                f"or {POSES} beside it; advsearch dashboard aligns photographs by phone"
+            )
+        if not files:
+            raise InputError(f"photographs: {folder}: expected a folder with photographs, got none in it")
+        Photographs().add_files(run, files)
+
+
+def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
+    """Copy the photographs that `POSES` lists, each under the name of the rendering that has its pose."""
+    # late, so that --help answers at once
+    from advsearch.files import read_text
+    from advsearch.runs.store import NAME as STORE
+    from advsearch.runs.store import Store
+
+    with Store(run / STORE, read_only=True) as store:
+        rows = [(row.step, {name: value["value"] for name, value in row.values.items()}) for row in store.rows("sweep")]
+    for line, pose in enumerate(csv.DictReader(read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()), 2):
+        where, file = f"photographs: {folder / POSES}, line {line}", folder / Path(str(pose.pop("file", ""))).name
+        if not file.is_file():
+            raise InputError(f"{where}: expected the name of a photograph beside it under `file`, got {file.name!r}")
+        steps = [step for step, values in rows if all(_is_at(values.get(name), text) for name, text in pose.items())]
+        if len(steps) != 1:
+            told = ", ".join(f"{name} {text}" for name, text in pose.items())
+            raise InputError(
+                f"{where}: expected a pose that one rendering of {run.name} has, got {told}, which {len(steps)} have; "
+                "sweep a grid of the poses"
+            )
+        shutil.copyfile(file, out / f"rendering-{steps[0]}-{file.name}")
+    return out
+
+
+def _is_at(value: object, text: str | None) -> bool:
+    if text is None or value is None or isinstance(value, str):
+        return text is not None and value == text.strip()
+    try:
+        return math.isclose(float(str(value)), float(text), rel_tol=1e-3, abs_tol=1e-3)
+    except ValueError:
+        return False

@@ -1,0 +1,279 @@
+"""An experiment: a function that answers a question about a model, with its settings and its result.
+
+    @experiment("count --runs mug-texture-001", positional_args=("runs",))
+    def count(context: RunContext[CountConfig]) -> CountResult: ...
+
+The command, the Python function, the run directory and the page are made from it. Built-in experiments are listed in
+`advsearch.catalog`; a package adds its own by an entry point of the group `advsearch.experiments`. The module of an
+experiment imports what is heavy inside functions, since the command line reads it for its help.
+"""
+
+from __future__ import annotations
+
+import inspect
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar, get_args, get_type_hints
+
+from advsearch import registry
+from advsearch.errors import FELL_SHORT
+from advsearch.interrupts import interruptible
+from advsearch.progress import NullProgress, Progress, watcher
+from advsearch.report.shown import Claim, ShownResult, result_figure, shown
+from advsearch.runs.directory import RunDirectory, begun
+from advsearch.runs.files import write_bytes
+from advsearch.runs.results import INTERRUPTED, Result
+from advsearch.settings import Config
+from advsearch.viewer.pages import keep_result
+
+Settings = TypeVar("Settings", bound=Config, covariant=True)
+AnyResult = TypeVar("AnyResult", bound=Result)
+Made = TypeVar("Made", bound=Result)
+
+SHARED_RESULT_FIELDS = {
+    "object": "object",
+    "objects": "objects",
+    "environment": "lit_by",
+    "controls": "controls",
+    "model": "model",
+    "task": "task_name",
+    "policy": "policy_name",
+    "seed": "seed",
+}
+"""Fields of a result that are filled from the settings, with the attribute of the settings."""
+
+PYTHON_TYPES = {
+    "object": "Scene | str | Path",
+    "model": "AnyModel",
+    "compared": "str | Path | Sequence[str | Path]",
+    "sweeps": "str | Path | Sequence[str | Path]",
+}
+"""Types that Python callers may pass for a positional setting, in place of its text."""
+
+
+class RunContext(ExitStack, Generic[Settings]):
+    """What the function of an experiment works with: settings, progress, and the run directory.
+
+    Attributes:
+        config: the settings.
+        progress: is told how far the experiment is.
+        resumed: the folder of the run that is continued; None for a new one.
+        ending: how the run ends, "done" or "interrupted".
+    """
+
+    def __init__(self, config: Settings, progress: Progress | None = None, resumed: Path | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self.progress = progress or NullProgress()
+        self.resumed = resumed
+        self.ending = "done"
+        self._start_time = time.perf_counter()
+
+    @cached_property
+    def run(self) -> RunDirectory:
+        """The run directory. The first access creates it, so check everything that may be wrong before."""
+        return self.enter_context(RunDirectory.of(self.config, self.resumed))
+
+    @property
+    def has_run(self) -> bool:
+        """Whether the run directory has been created through this context."""
+        return "run" in vars(self)
+
+    @contextmanager
+    def until_interrupted(self) -> Iterator[None]:
+        """Run a block that Ctrl-C ends; the experiment continues behind it with `ending` "interrupted"."""
+        try:
+            with interruptible():
+                yield
+        except KeyboardInterrupt:
+            self.ending = INTERRUPTED
+
+    def result(self, result_type: type[Made], **fields: Any) -> Made:
+        """Return a result with the given fields and those that every result has.
+
+        These are what the settings state (`SHARED_RESULT_FIELDS`), the run, how it ended, the command line and the
+        total seconds, which are added to the `seconds` that are given.
+        """
+        settings = self.config
+        shared = {
+            name: getattr(settings, attribute)
+            for name, attribute in SHARED_RESULT_FIELDS.items()
+            if hasattr(settings, attribute)
+        }
+        for name in ("objects", "controls"):
+            if name in shared:
+                shared[name] = list(shared[name])
+        seconds = {"total": time.perf_counter() - self._start_time, **fields.pop("seconds", {})}
+        shared |= {
+            "run": str(self.run.path),
+            "ending": self.ending,
+            "seconds": seconds,
+            "command_line": settings.command_line(),
+        }
+        return result_type(**{**shared, **fields})
+
+
+def run_and_save(function: Callable[[RunContext[Settings]], AnyResult], context: RunContext[Settings]) -> AnyResult:
+    """Call the function of an experiment, and save its result, page and figure in its run directory.
+
+    Nothing is saved where the function made no run through the context: then it has saved its result itself.
+    """
+    with context:
+        result = function(context)
+        if not context.has_run:
+            return result
+        for suffix, data in result_figure(shown(result)).items():
+            write_bytes(context.run.path / "images" / f"{context.config.command}.{suffix}", data)
+        return keep_result(context.run, result)
+
+
+def run_experiment(config: Config, *, progress: Progress | None = None, resumed: Path | None = None) -> Result:
+    """Run the experiment that the settings are of.
+
+    Args:
+        config: settings of any experiment; `config.command` names it.
+        progress: is told how far it is.
+        resumed: the folder of a run to continue; None for a new run.
+
+    Raises:
+        InputError: a setting that the caller can correct; nothing is written then.
+    """
+    from advsearch.api.names import check_names  # imports scipy
+
+    check_names(config)
+    writes_run = resumed is None and getattr(config, "out", None) is None
+    # The folder is made before heavy imports, so that a run that is stopped early can be listed.
+    with begun(config) if writes_run else nullcontext(resumed) as folder:
+        experiment = registry.get_experiment(config.command)
+        return experiment.run(config, progress=progress, resumed=folder)
+
+
+class PositionalArgument(NamedTuple):
+    """A setting that the command line also takes without its flag."""
+
+    metavar: str  # what the help calls it
+    expected: str  # completes "expected ..." where it is missing
+    more: str = ""  # what the help adds
+    many: bool = False  # whether there may be several
+
+
+def fail_check(falls_short: Callable[[Any], bool]) -> Callable[[Any], int]:
+    """Return an `exit_status` that is 3 where a check falls short, and else 0."""
+    return lambda result: FELL_SHORT if falls_short(result) else 0
+
+
+def succeed(result: Any) -> int:
+    return 0
+
+
+@dataclass(frozen=True)
+class Experiment(Generic[AnyResult]):
+    """An experiment: its function, the classes of its settings and its result, and how it is presented.
+
+    Attributes:
+        function: ``(context: RunContext[NameConfig]) -> NameResult``.
+        settings: the class of its settings.
+        result: the class of its result.
+        examples: lines of a shell for its help, without `advsearch`.
+        positional_args: settings that the Python function takes by position.
+        about: the setting that names a run or a file which the experiment is about.
+        positional: how the command line takes `about` without its flag; None for not at all.
+        defaults_from_run: ``(run.yaml, typed arguments) -> settings`` that the run in `about` provides.
+        python_function: "module:function" that Python calls, where it takes more than settings; else it is made.
+        help_suffix: what its help adds to the line in the catalog.
+        exit_status: ``result -> int``, the exit status of the command.
+        choices: "module:function" that returns the names that `about` may have, each with a line of help.
+        view: ``result -> ShownResult``, what terminal, page and notebook show; None shows all fields.
+        claims: ``result -> claims`` that a run supports, for `advsearch report`.
+        page: ``(run, result) -> HTML or None``, for a page of its own kind.
+        other_results: further classes of results, each by a field that it alone has.
+    """
+
+    function: Callable[..., AnyResult]
+    settings: type[Config]
+    result: type[AnyResult]
+    examples: tuple[str, ...] = ()
+    positional_args: tuple[str, ...] = ()
+    about: str = ""
+    positional: PositionalArgument | None = None
+    defaults_from_run: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None
+    python_function: str = ""
+    help_suffix: str = ""
+    exit_status: Callable[[Any], int] = succeed
+    choices: str = ""
+    view: Callable[[Any], ShownResult] | None = None
+    claims: Callable[[Any], Iterable[Claim]] | None = None
+    page: Callable[[Path, Any], str | None] | None = None
+    other_results: Mapping[str, type[Result]] = field(default_factory=dict)
+
+    def run(
+        self, config: Any, *, progress: Progress | None = None, resumed: Path | None = None, **arguments: Any
+    ) -> AnyResult:
+        """Run the experiment with settings, and save its result; `arguments` go to the function."""
+        return run_and_save(partial(self.function, **arguments), RunContext(config, progress, resumed))
+
+    def __call__(self, *args: Any, **settings: Any) -> AnyResult:
+        result: AnyResult = self.python(*args, **settings)
+        return result
+
+    @cached_property
+    def python(self) -> Callable[..., Any]:
+        """The function for Python, with every setting as a keyword."""
+        if self.python_function:
+            function: Callable[..., Any] = registry.imported(self.python_function)
+            return function
+        return self._make_python_function()
+
+    def _make_python_function(self) -> Callable[..., Any]:
+        from advsearch.api.keywords import asks, configured  # imports torch
+
+        def function(*args: Any, progress: Any = None, **settings: Any) -> AnyResult:
+            positional = dict(zip(self.positional_args, args, strict=False))
+            config = configured(self.settings, **positional, **settings)
+            return self.run(config, progress=watcher(progress))
+
+        kinds = inspect.Parameter
+        parameters = [self._make_positional_parameter(name) for name in self.positional_args]
+        parameters.append(kinds("progress", kinds.KEYWORD_ONLY, default=None, annotation="Watched"))
+        parameters.append(kinds("settings", kinds.VAR_KEYWORD))
+        signature = inspect.Signature(parameters, return_annotation=self.result.__name__)
+        function.__signature__ = signature  # type: ignore[attr-defined]
+        function.__name__ = self.settings.command
+        function.__qualname__ = self.settings.command
+        function.__doc__ = self.function.__doc__
+        function.__module__ = self.function.__module__
+        return asks(self.settings)(function)
+
+    def _make_positional_parameter(self, name: str) -> inspect.Parameter:
+        setting = self.settings.model_fields[name]
+        return inspect.Parameter(
+            name,
+            inspect.Parameter.POSITIONAL_OR_KEYWORD,
+            default=inspect.Parameter.empty if setting.is_required() else setting.default,
+            annotation=PYTHON_TYPES.get(name, "str | Path"),
+        )
+
+
+def experiment(*examples: str, **attributes: Any) -> Callable[[Callable[..., AnyResult]], Experiment[AnyResult]]:
+    """Make an `Experiment` of a function ``(context: RunContext[NameConfig]) -> NameResult``.
+
+    Settings and result are read from the annotations; of a union of results the first is the main one.
+
+    Args:
+        examples: lines of a shell for its help, without `advsearch`.
+        attributes: other attributes of `Experiment`.
+    """
+
+    def decorate(function: Callable[..., AnyResult]) -> Experiment[AnyResult]:
+        hints = get_type_hints(function)
+        first_parameter = next(iter(inspect.signature(function).parameters))
+        (settings,) = get_args(hints[first_parameter])
+        returned = hints["return"]
+        result = (*get_args(returned), returned)[0]
+        return Experiment(function, settings, result, examples, **attributes)
+
+    return decorate

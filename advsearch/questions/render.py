@@ -1,0 +1,45 @@
+"""Render a picture of a scene, and say what the model sees in it."""
+
+from __future__ import annotations
+
+from advsearch.config import RenderConfig
+from advsearch.experiment import RunContext, experiment
+from advsearch.report.shown import ResultPart, ShownResult
+from advsearch.report.wording import SEEN, seen_cells, seen_text, things_rows
+from advsearch.runs.results import RenderResult
+
+
+def make_view(result: RenderResult) -> ShownResult:
+    """Return the file that was written, and a table of what the model predicts for each view."""
+    height, width = result.size
+    headline = f"{result.out}: {width} x {height} pixels"
+    if result.answered:
+        headline += f"\n{result.answered}: with the predictions drawn in"
+    if len(result.views) > 1:
+        rows = [
+            [f"{view.azimuth:g}", "; ".join(seen_text(result.task, answer) for answer in view.answers)]
+            for view in result.views
+        ]
+        heads = ("azimuth", f"model {result.model} sees")
+        return ShownResult(headline, [ResultPart(heads=heads, rows=rows)])
+    (view,) = result.views
+    predictions = [seen_cells(result.task, answer) for answer in view.answers]
+    sections = [ResultPart(f"Model {result.model} sees", rows=predictions)]
+    if view.things is not None:
+        things = things_rows({name: vars(thing) for name, thing in view.things.items()})
+        sections.append(ResultPart("In the picture", heads=("", *SEEN), rows=things))
+    return ShownResult(headline, sections)
+
+
+@experiment(
+    "render --object mug --environment kitchen --out mug.png",
+    "render --object mug.obj --environment room.hdr --out around.png --around 8",
+    "render --object mug --control 'pose={yaw: 30}' --set camera.elevation=50 --out mug.exr",
+    python_function="advsearch.api.render:render",
+    view=make_view,
+)
+def render(context: RunContext[RenderConfig]) -> RenderResult:
+    """Render pictures of a scene, and say what the model sees in them."""
+    from advsearch.api.render import render_picture_file  # imports torch
+
+    return render_picture_file(context.config, progress=context.progress)

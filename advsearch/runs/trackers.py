@@ -1,0 +1,125 @@
+"""Experiment trackers: MLflow, TensorBoard, and Weights & Biases get settings and the mean numbers of rows by kind.
+
+A thread of its own sends them, so that neither a slow network nor one that fails holds up the run.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from queue import Full, Queue
+from typing import Any
+
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.files import JsonObject
+from advsearch.runs.store import Row
+
+PACKAGES = {"mlflow": "mlflow", "tensorboard": "tensorboard.summary", "wandb": "wandb"}
+"""The trackers, and what of each is imported."""
+NUMBERS = ("objective", "score", "margin", "correct", "success", "probability")
+PATIENCE = 10.0  # seconds that the end of a run waits for what is still to be told
+WAITING = 10_000  # messages that may wait; further ones are not told
+LONGEST = 250
+_LOG = logging.getLogger("advsearch")
+
+
+def check_tracker(name: str | None) -> None:
+    if name is None:
+        return
+    if name not in PACKAGES:
+        raise UnknownNameError("log", name, PACKAGES)
+    _package(name)
+
+
+def _package(name: str) -> Any:
+    try:
+        return importlib.import_module(PACKAGES[name])
+    except ImportError:
+        raise InputError(f"log {name}: needs {name}; pip install {name}, or leave `log` out") from None
+
+
+class Tracker:
+    """Tells rows to a tracker from a thread of its own."""
+
+    def __init__(self, name: str, folder: Path, settings: JsonObject) -> None:
+        self._name = name
+        self._right: dict[str, list[int]] = defaultdict(lambda: [0, 0])
+        self._waiting: Queue[tuple[MetricValues, int] | None] = Queue(WAITING)
+        told = {key: str(value)[:LONGEST] for key, value in settings.items() if value is not None}
+        self._thread = threading.Thread(target=self._work, args=(folder, told), name=name, daemon=True)
+        self._thread.start()
+
+    def rows(self, rows: Sequence[Row]) -> None:
+        """Tell rows that were kept; returns at once."""
+        kinds: dict[str, list[Row]] = defaultdict(list)
+        for row in rows:
+            kinds[row.kind].append(row)
+        for kind, group in kinds.items():
+            self._put((self._numbers(kind, group), group[-1].step))
+
+    def close(self) -> None:
+        """Wait, at most `PATIENCE` seconds, until all is told; a second call does nothing."""
+        self._put(None)
+        self._thread.join(PATIENCE)
+
+    def _numbers(self, kind: str, rows: Sequence[Row]) -> MetricValues:
+        numbers = {}
+        for name in NUMBERS:
+            given = [float(value) for row in rows if (value := getattr(row, name)) is not None]
+            if given:
+                numbers[f"{kind}/{name}"] = sum(given) / len(given)
+        judged = [row.correct for row in rows if row.correct is not None]
+        counts = self._right[kind]
+        counts[0], counts[1] = counts[0] + sum(judged), counts[1] + len(judged)
+        if counts[1]:
+            numbers[f"{kind}/accuracy"] = counts[0] / counts[1]
+        return numbers
+
+    def _put(self, message: tuple[MetricValues, int] | None) -> None:
+        try:
+            self._waiting.put_nowait(message)
+        except Full:
+            return  # a tracker that is that slow is told less; the run has all of it
+
+    def _work(self, folder: Path, settings: Mapping[str, str]) -> None:
+        try:
+            tell, close = _opened(self._name, folder, settings)
+            while (message := self._waiting.get()) is not None:
+                tell(*message)
+            close()
+        except Exception as error:  # whatever a tracker does, the run goes on
+            _LOG.warning("%s is told nothing more: %s", self._name, str(error)[:300] or type(error).__name__)
+
+
+def _opened(
+    name: str, folder: Path, settings: Mapping[str, str]
+) -> tuple[Callable[[MetricValues, int], object], Callable[[], object]]:
+    """Return what tells a tracker numbers by name, of a step of their kind, and what ends its run."""
+    package = _package(name)
+    if name == "mlflow":
+        package.start_run(run_name=folder.name, nested=True)
+        package.log_params(settings)
+        return lambda numbers, step: package.log_metrics(dict(numbers), step=step), package.end_run
+    if name == "tensorboard":  # its files are in the run, whose run.yaml has the settings
+        writer = package.Writer(str(folder / "artifacts" / "tensorboard"))
+
+        def add(numbers: MetricValues, step: int) -> None:
+            for each, value in numbers.items():
+                writer.add_scalar(each, value, step)
+
+        return add, writer.close
+    run = package.init(project="advsearch", name=folder.name, config=dict(settings), reinit="create_new")
+
+    def log(numbers: MetricValues, step: int) -> None:
+        # each kind has steps of its own, which are told as a number: its one counter only ever goes up
+        kind = next(iter(numbers), "rows/").partition("/")[0]
+        run.log({**numbers, f"{kind}/step": step})
+
+    return log, run.finish
+
+
+MetricValues = Mapping[str, float]

@@ -1,0 +1,33 @@
+"""The sRGB encoding and its inverse, for numpy arrays and torch tensors (IEC 61966-2-1)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Values = TypeVar("Values", npt.NDArray[np.float32], "Tensor")
+LOW_END = 0.0031308  # linear values up to which the encoding is straight
+
+
+def srgb_to_linear(display: Values) -> Values:
+    """Decode display-referred sRGB in [0, 1] to linear values; any shape, float32; differentiable everywhere."""
+    low_end, low = display <= 0.04045, display / 12.92
+    curve = ((display.clip(0.04045, None) + 0.055) / 1.055) ** 2.4
+    if isinstance(display, np.ndarray):
+        return np.where(low_end, low, curve).astype(np.float32)
+    return low.where(low_end, curve)
+
+
+def linear_to_srgb(linear: Values) -> Values:
+    """Encode linear values as display-referred sRGB, clipped to [0, 1]; any shape, float32; differentiable."""
+    clipped = linear.clip(0.0, 1.0)
+    low_end, low = clipped <= LOW_END, clipped * 12.92
+    curve = 1.055 * clipped.clip(LOW_END, None) ** (1.0 / 2.4) - 0.055
+    if isinstance(linear, np.ndarray):
+        return np.where(low_end, low, curve).astype(np.float32)
+    return low.where(low_end, curve)

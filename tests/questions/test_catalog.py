@@ -1,0 +1,160 @@
+"""Experiments are listed in the catalog or come from packages; without one of them the tool works."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import advsearch
+from advsearch import registry
+from advsearch.catalog import BUILT_INS, is_present
+from advsearch.experiment import Experiment
+from advsearch.settings import HEADER
+
+PACKAGE = Path(advsearch.__file__).parent
+CORE = ("attack", "sweep", "render")
+REMOVABLE = [part for part in BUILT_INS if part.name not in CORE]
+
+
+def test_every_part_of_the_catalog_is_there_and_is_what_it_says() -> None:
+    for part in BUILT_INS:
+        assert is_present(part.target.partition(":")[0]), part
+        assert part.help[0].islower() and not part.help.endswith("."), part
+    for name, experiment in registry.EXPERIMENTS.items():
+        assert isinstance(experiment, Experiment)
+        assert experiment.settings.command == name and experiment.result.command == name
+
+
+def copy_package(folder: Path, without: tuple[str, ...] = ()) -> None:
+    """Copy the package into a folder, without some of its experiments."""
+    shutil.copytree(PACKAGE, folder / "advsearch", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in without:
+        path = folder / "advsearch" / "questions" / name
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.with_suffix(".py").unlink()
+
+
+def run_python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    return subprocess.run(
+        [sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def test_without_all_removable_experiments_the_tool_works(tmp_path: Path) -> None:
+    names = tuple(part.name for part in REMOVABLE)
+    copy_package(tmp_path, names)
+    shown_help = run_python(tmp_path, "-m", "advsearch", "--help")
+    assert shown_help.returncode == 0, shown_help.stderr
+    assert "  attack " in shown_help.stdout
+    assert not [name for name in names if f"\n  {name} " in shown_help.stdout]
+    listed = run_python(tmp_path, "-m", "advsearch", "list", "objects")
+    assert listed.returncode == 0 and "mug" in listed.stdout
+    unknown = run_python(tmp_path, "-m", "advsearch", "harden")
+    assert unknown.returncode == 2 and "unknown command 'harden'" in unknown.stderr
+    imports = (
+        "import advsearch; from advsearch.config import CONFIGS; import advsearch.viewer.pages; "
+        "import advsearch.questions.attack.carry_out, advsearch.questions.sweep.carry_out; print(*CONFIGS)"
+    )
+    known = run_python(tmp_path, "-c", imports)
+    assert known.returncode == 0, known.stderr
+    assert known.stdout.split() == ["attack", "render", "sweep"]
+    attacked = run_python(
+        tmp_path,
+        *("-m", "advsearch", "attack", "--object", "mug", "--control", "pose", "--steps", "2", "--trials", "6"),
+        *("--resolution", "32", "--spp", "2", "--verify-spp", "2", "--no-baseline", "--run", "kept", "--json"),
+    )
+    assert attacked.returncode == 0, attacked.stderr
+    assert (tmp_path / "runs" / "kept" / "report.html").is_file()
+
+
+IMPORT_WITHOUT_EACH = """
+import os, pkgutil, sys
+from importlib import import_module
+import matplotlib, mitsuba, pandas, scipy.stats, torch  # once, for all children
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name == blocked or name.startswith(blocked + "."):
+            raise ModuleNotFoundError(name)
+
+for removed in sys.argv[1:]:
+    sys.stdout.flush()
+    if os.fork():
+        os.wait()
+        continue
+    blocked = f"advsearch.questions.{removed}"
+    sys.meta_path.insert(0, Blocker())
+    import advsearch, advsearch.cli.main, advsearch.viewer.pages
+    from advsearch.registry import EXPERIMENTS
+    for experiment in EXPERIMENTS.values():
+        module = sys.modules[experiment.function.__module__]
+        for part in pkgutil.iter_modules(getattr(module, "__path__", [])):
+            import_module(f"{module.__name__}.{part.name}")
+    print(removed, *sorted(EXPERIMENTS))
+    sys.stdout.flush()
+    os._exit(0)
+"""
+
+
+def test_without_any_one_experiment_all_others_can_be_imported() -> None:
+    removable = [part.name for part in REMOVABLE]
+    done = run_python(PACKAGE.parent, "-c", IMPORT_WITHOUT_EACH, *removable)
+    every = {part.name for part in BUILT_INS}
+    expected = [" ".join([name, *sorted(every - {name})]) for name in removable]
+    assert done.stdout.splitlines() == expected, done.stderr
+
+
+SETUP = """from setuptools import setup
+
+setup(
+    name="advsearch-count",
+    version="1",
+    py_modules=["advsearch_count"],
+    entry_points={"advsearch.experiments": ["count = advsearch_count:count"]},
+)
+"""
+
+
+def test_the_experiment_of_the_docs_is_a_package_of_its_own(tmp_path: Path) -> None:
+    """The package is installed in a folder of the Python path; command, page and Python know the experiment."""
+    design = (Path(__file__).parents[2] / "docs" / "design.md").read_text()
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", design, re.DOTALL) if "@experiment" in block]
+    source, site = tmp_path / "source", tmp_path / "site"
+    source.mkdir()
+    (source / "advsearch_count.py").write_text(code)
+    (source / "setup.py").write_text(SETUP)
+    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*install, "--target", str(site), str(source)], check=True, capture_output=True)
+    for name in ("first", "second"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "run.yaml").write_text(HEADER)
+
+    def run(*words: str) -> str:
+        environment = {**os.environ, "PYTHONPATH": f"{site}{os.pathsep}{PACKAGE.parent}"}
+        done = subprocess.run(
+            [sys.executable, *words], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert "  count       count the files that runs have" in run("-m", "advsearch", "--help")
+    shown_help = run("-m", "advsearch", "count", "--help")
+    assert "Count the files that runs have." in shown_help
+    assert "advsearch count --runs mug-texture-001" in shown_help
+    counted = run("-m", "advsearch", "count", "--runs", "first,second", "--json", "--run", "kept")
+    assert json.loads(counted)["files"] == {"first": 1, "second": 1}
+    assert "There are 2 files." in run("-m", "advsearch", "show", "kept")
+    assert "There are 2 files." in (tmp_path / "runs" / "kept" / "report.html").read_text()
+    repeated = run("-m", "advsearch", "run", "runs/kept/run.yaml", "runs=first", "--json", "--run", "again")
+    assert json.loads(repeated)["files"] == {"first": 1}
+    called = "import advsearch, inspect; from advsearch import count; print(inspect.signature(count)); "
+    python = run("-c", f"{called} print(count('first', run='third'), advsearch.load_run('third'))")
+    assert "(runs: 'str | Path'" in python and python.count("files={'first': 1}") == 2
