@@ -93,6 +93,15 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
             part.unlink(missing_ok=True)
 
 
+def check_free_folder(out: Path, setting: str) -> None:
+    """Check that a folder that is to be written whole is not there, or is empty. Raises InputError, also of a link: a
+    folder takes the place of no link, and what it leads to may be somebody else's."""
+    if os.path.islink(out):
+        raise InputError(f"{setting}: expected a new or an empty folder, got the link {out}; name the folder itself")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{setting}: {out} is there already and not empty; name another folder")
+
+
 def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> Path:
     """Write `data` to `path`, whole or not at all, and return the path; `durable` as for `replacing`."""
     with replacing(path, durable=durable) as part:
