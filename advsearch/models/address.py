@@ -224,7 +224,7 @@ class _NotesConnections(urllib.request.AbstractHTTPHandler):
             self._connections.append(connection)
             return connection
 
-        return super().do_open(connection_to, req, **options)  # type: ignore[arg-type]
+        return super().do_open(connection_to, req, **options)
 
 
 class _Handler(_NotesConnections, urllib.request.HTTPHandler):

@@ -214,7 +214,7 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
             net.load_state_dict({name: one + 1.0 for name, one in given.items()})
             rounds = Rounds(run, course_of(config.model_copy(update={"clean_loss": loss}), net))
             advanced = list[int]()
-            watcher: Any = SimpleNamespace(advance=lambda n, worst: advanced.append(n))
+            watcher: Any = SimpleNamespace(advance=lambda n, worst, told=advanced: told.append(n))
             rounds.progress = watcher
             found, part = rounds.mixed([])
             assert sum(advanced) == looked_at, "whoever watches sees each part of the way"

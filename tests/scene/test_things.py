@@ -131,7 +131,7 @@ def test_a_room_has_walls_and_shelves_that_nothing_stands_in() -> None:
 def test_a_camera_inside_a_house_is_said_and_how_often_it_is_there() -> None:
     def notes(given: dict[str, float], **ranges: list[float]) -> tuple[str, ...]:
         scene = describe("car", "avenue", given=given)
-        control = make_control("camera", dict(ranges)) if ranges else make_control("material")
+        control = make_control("camera", dict(ranges)) if ranges else make_control("pose")
         return make_space([control], scene).notes(scene)
 
     inside = {"camera.azimuth": 90.0, "camera.distance": 20.0, "camera.elevation": 5.0}
