@@ -33,7 +33,7 @@ from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, read_python_only
-from advsearch.runs.files import placed_by, storage_errors, write_png, write_text
+from advsearch.runs.files import check_free_folder, placed_by, storage_errors, write_png, write_text
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.scene.assets import Bools
 from advsearch.scene.description import OBJECT
@@ -97,8 +97,7 @@ def write_dataset(run: str | Path, out: Path, format: str, *, every: bool, progr
     those that not all models are right about. Returns how many there are (of 0, nothing is written), and sentences that
     a reader has to know. Raises InputError where the scene of the run is not to be had any more, or `out` is not empty,
     and FileFormatError where the run is of another command, or has not ended."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"out: {out} is there already and not empty; name another folder")
+    check_free_folder(out, "out")
     folder, categories = find_run(run), Categories()
     with placed_by("out"):
         with storage_errors(out):

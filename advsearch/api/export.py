@@ -94,8 +94,8 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     or stock Mitsuba has no such scene."""
     path = out if out.suffix.lower() == XML else out / NAME
     taken = [path, *path.parent.glob(f"{path.stem}-*")] if path.parent.is_dir() else []
-    there = [file for file in taken if file.exists()]
-    if there or path.parent.is_file():
+    there = [file for file in taken if os.path.lexists(file)]
+    if there or path.parent.is_file() or os.path.islink(out):
         raise InputError(f"out: {(there or [path.parent])[0]} is there already; choose another name")
     adversarial = adversarial_of(run)
     renderer, inputs = adversarial.problem.renderer, adversarial.inputs
@@ -271,7 +271,7 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
     exact values, `marks.png` to project first, `seen.png`, where the run's camera sees these marks, and `README.txt`;
     return sentences about what to set. Raises errors as `adversarial_of`, and InputError where it has no projector, or
     the folder is there already."""
-    if out.exists():
+    if os.path.lexists(out):
         raise InputError(f"out: {out} is there already; choose another name")
     adversarial = adversarial_of(run)
     slices = adversarial.problem.space.slices(adversarial.u)

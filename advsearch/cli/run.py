@@ -14,10 +14,11 @@ from advsearch.cli.main import argument, command
 from advsearch.cli.show import show_run
 from advsearch.errors import InputError
 from advsearch.registry import allow_named, get_experiment
-from advsearch.runs.directory import CONFIG, HOME, find_run, read_python_only
+from advsearch.runs.directory import CONFIG, HOME, REPORT, find_run, read_python_only
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.settings import parse_assignment
 from advsearch.settings.values import put
+from advsearch.viewer.pages import write_page
 
 
 @command(
@@ -85,6 +86,8 @@ def resume(args: argparse.Namespace) -> int:
     adds = asked == "recipe" or (changes.get("surface") is True and asked == "sweep")
     if finished(path) and not adds:
         print(f"advsearch: {path} is done already", file=sys.stderr)
+        if not (path / REPORT).is_file():  # the disk was full as it was written, or it was removed
+            write_page(path)
         return show_run(str(path), args.json)
     if only := [part.text for part in read_python_only(path)]:
         raise InputError(

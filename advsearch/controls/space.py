@@ -15,7 +15,8 @@ from advsearch.controls.base import NOTHING, Control, Group, Moved, Value
 from advsearch.copies import is_ours
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
-from advsearch.scene.grounds import CameraView, past, surroundings_of, view_of
+from advsearch.scene.grounds import CameraView, past, place_of, surroundings_of, view_of
+from advsearch.scene.things import camera_remarks
 
 VIEWS = 256  # configurations of a camera, a power of two, by which is found how far it goes
 
@@ -169,7 +170,8 @@ class Space:
         goes in it: see `advsearch.scene.grounds`."""
         scene, views = self.scene or scene, list[CameraView]()
         turns = any(group.setting == "environment.rotation" for group in self.groups)
-        if surroundings_of(scene) is not None:
+        has_solids = any(part.solids for part in scene.around.values())
+        if has_solids or surroundings_of(scene) is not None:
             views = [view_of(scene)]
             for control, start in self.slices(self.start):
                 if not (control.slots or isinstance(control, _Held)) or "camera.to_world" not in control.inputs(start):
@@ -187,7 +189,8 @@ class Space:
                     for seen in inputs
                 ]
                 break
-        return (*scene.notes, *past(scene, views, turns=turns))
+        eyes = [place_of(view) for view in views] if has_solids else []
+        return (*scene.notes, *past(scene, views, turns=turns), *camera_remarks(scene, eyes))
 
     def artifacts(self, u: Tensor) -> dict[str, Tensor]:
         """Return the pictures worth keeping of a configuration, by file stem."""

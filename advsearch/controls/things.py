@@ -4,7 +4,8 @@
 
 `away` points from the object to the thing. Free is what overlaps with no other outline on the ground: the object's, the
 camera's, those of things that stay, and those of things before it in the list. Two convex outlines of which one moves
-straight on overlap over one stretch of its way, so that t is exact.
+straight on overlap over one stretch of its way, so that t is exact. A thing that would stand in a solid of the place, a
+house or a lamp post, first goes back towards the object until it is free of it.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Doubles
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.geometry import affine, middle, standing
-from advsearch.scene.parts import MeshPart
+from advsearch.scene.parts import Footprint, MeshPart
 from advsearch.scene.settings import ORBIT, moving
-from advsearch.scene.things import Footprint, blocked, footprint, ground_height
+from advsearch.scene.things import blocked, footprint, ground_height
 
 GAP = 0.01  # metres between a thing that was moved away and what it would have stood in
 CAMERA, NEAR = 0.3, 0.05
@@ -133,6 +134,7 @@ class ThingsControl(Control):
         around = eye[:2] + free * np.stack([np.cos(EIGHTHS), np.sin(EIGHTHS)], axis=1)
         others = [thing, Footprint(around, eye[2], eye[2] + free)]
         others += [_footprint(scene, name, so_far) for name in scene.things if name not in self._moved]
+        solids = [solid for part in scene.around.values() for solid in part.solids]
         stands = {}
         for name in self._moved:
             x, y, heading, away = (float(values[f"{name}.{one.name}"].detach()) for one in self.parameters)
@@ -146,7 +148,11 @@ class ThingsControl(Control):
             way = asked - middle_of
             way = way / np.linalg.norm(way) if way.any() else np.array([1.0, 0.0])
             pushed = 0.0
-            for begin, end in sorted(blocked(here, other, way) for other in others if not away):
+            in_solids = [] if away else [blocked(here, solid, way) for solid in solids]
+            if any(begin < 0.0 < end for begin, end in in_solids):
+                pushed = min(begin for begin, end in in_solids if begin < 0.0 < end) - GAP / metres
+            in_others = [] if away else [blocked(here, other, way) for other in others]
+            for begin, end in sorted(in_others + in_solids):
                 if begin < pushed < end:
                     pushed = end + GAP / metres
             place = asked + pushed * way

@@ -11,17 +11,22 @@ from __future__ import annotations
 import base64
 import hashlib
 import http.client
+import io
 import ipaddress
 import json
+import math
 import os
 import re
+import socket
 import ssl
+import threading
 import time
 import urllib.error
 import urllib.request
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import wait as futures_wait
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
@@ -59,6 +64,7 @@ TRIES, FIRST_WAIT, LONGEST_WAIT = 5, 1.0, 60.0
 MOST_AT_ONCE = 64
 BUSY = (408, 409, 425, 429, 500, 502, 503, 504, 529)  # statuses of a server that may answer later
 LARGEST = 1 << 20  # bytes of an answer
+LONGEST_FAILURE = 2000  # bytes that are read of what comes with a status that is no success
 LONGEST = 1000  # characters that are kept of an answer in words
 LEAST = 1e-6  # the share of a name that an answer leaves out, or gives less: its logarithm is the logit
 REFUSED = "(refused)"  # the words of a model that declines to answer
@@ -171,6 +177,62 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
 
     def redirect_request(self, *_: Any) -> None:
         return None
+
+
+class _Connection(http.client.HTTPConnection):
+    """A connection that ends at a time, and that another thread can break off, whatever it waits for.
+
+    A socket's own limit begins anew with each byte that comes, so it alone is no limit for an answer.
+    """
+
+    end = math.inf
+    connected: socket.socket | None = None
+
+    def connect(self) -> None:
+        super().connect()
+        self.connected = self.sock
+        if time.monotonic() > self.end:  # nobody waits any more, so nothing is sent
+            self.close()
+            raise TimeoutError("timed out: connected too late")
+
+    def break_off(self) -> None:
+        """End whatever is being sent or read; a connection that has ended stays so."""
+        for opened in (self.sock, self.connected):
+            if opened is not None:
+                with suppress(OSError):  # not the method of an SSL socket, which would wait for the other side
+                    socket.socket.shutdown(opened, socket.SHUT_RDWR)
+
+
+class _SecureConnection(_Connection, http.client.HTTPSConnection):
+    pass
+
+
+class _NotesConnections(urllib.request.AbstractHTTPHandler):
+    """Opens connections that end at a time, and notes them where another thread can break them off."""
+
+    def __init__(self, end: float, connections: list[_Connection]) -> None:
+        super().__init__()
+        self._end = end
+        self._connections = connections
+
+    def do_open(self, http_class: Any, req: urllib.request.Request, **options: Any) -> Any:
+        is_secure = issubclass(http_class, http.client.HTTPSConnection)
+
+        def connection_to(host: str, **more: Any) -> _Connection:
+            connection = (_SecureConnection if is_secure else _Connection)(host, **more)
+            connection.end = self._end
+            self._connections.append(connection)
+            return connection
+
+        return super().do_open(connection_to, req, **options)
+
+
+class _Handler(_NotesConnections, urllib.request.HTTPHandler):
+    pass
+
+
+class _SecureHandler(_NotesConnections, urllib.request.HTTPSHandler):
+    pass
 
 
 @dataclass(eq=False)
@@ -352,20 +414,34 @@ class AskedModel:
         return count
 
     def _together(self, bodies: Sequence[bytes]) -> list[dict[str, Any] | Exception]:
+        """Send bodies at the same time, and return what is answered to each, or why nothing is.
 
-        def sent(body: bytes) -> dict[str, Any] | Exception:
-            try:
-                return self._sent(body)
-            except (OSError, http.client.HTTPException, ModelError) as error:  # URLError is an OSError
-                return error
-
-        if len(bodies) == 1:
-            return [sent(bodies[0])]
+        All is over `seconds` later, whatever a server does meanwhile: what is still under way is broken off.
+        """
+        seconds = self.limits["seconds"]
+        end = time.monotonic() + seconds
         pool = ThreadPoolExecutor(len(bodies))
+        connections: list[_Connection] = []
         try:
-            return list(pool.map(sent, bodies))
+            futures = [pool.submit(self._try_to_send, body, end, connections) for body in bodies]
+            waited_for = futures_wait(futures, timeout=min(seconds, threading.TIMEOUT_MAX))
         finally:
             pool.shutdown(wait=False)  # after Ctrl-C nobody waits for answers
+            for connection in connections:
+                connection.break_off()
+        late = TimeoutError(f"timed out: no answer within {seconds:g} seconds")
+        return [future.result() if future in waited_for.done else late for future in futures]
+
+    def _try_to_send(self, body: bytes, end: float, connections: list[_Connection]) -> dict[str, Any] | Exception:
+        try:
+            return self._sent(body, end, connections)
+        except urllib.error.HTTPError as error:
+            with error, suppress(OSError, http.client.HTTPException):
+                text = error.read(LONGEST_FAILURE)
+                error = urllib.error.HTTPError(error.url, error.code, error.reason, error.headers, io.BytesIO(text))
+            return error
+        except (OSError, http.client.HTTPException, ModelError) as error:  # URLError is an OSError
+            return error
 
     def _failure(self, error: Exception, *, first: bool) -> tuple[str, bool, float]:
         """Return why nothing was answered, whether it may be later, and after how many seconds."""
@@ -384,30 +460,27 @@ class AskedModel:
             elif code in (401, 403):
                 why = f"status {code}: the key in {KEY} {'is not accepted' if _key() else 'is missing'}"
             else:
-                why = f"status {code} {self._clean(str(error.reason))}: "
-                with suppress(OSError, http.client.HTTPException):
-                    why += self._clean(error.read(2000).decode(errors="replace"))[:300]
+                text = error.read(LONGEST_FAILURE).decode(errors="replace")
+                why = f"status {code} {self._clean(str(error.reason))}: {self._clean(text)[:300]}"
         asked_to = headers.get("Retry-After", "")
         return why, code in BUSY, float(asked_to) if asked_to.isdigit() else 0.0
 
-    def _sent(self, body: bytes) -> dict[str, Any]:
+    def _sent(self, body: bytes, end: float, connections: list[_Connection]) -> dict[str, Any]:
         key = _key()
         headers = {"Content-Type": "application/json", "User-Agent": "advsearch"}
         request = urllib.request.Request(self.url, body, headers)
         if key:
             request.add_unredirected_header("Authorization", f"Bearer {key}")
-        handlers: list[Any] = [_NoRedirect]
+        handlers: list[Any] = [_NoRedirect, _Handler(end, connections), _SecureHandler(end, connections)]
         if is_local(request.host.rpartition(":")[0].strip("[]") or request.host):
             handlers.append(urllib.request.ProxyHandler({}))
-        end, parts, size = time.monotonic() + self.limits["seconds"], list[bytes](), 0
+        parts, size = list[bytes](), 0
         with urllib.request.build_opener(*handlers).open(request, timeout=self.limits["seconds"]) as response:
             while part := response.read1(1 << 16):
                 parts.append(part)
                 size += len(part)
                 if size > scaled(LARGEST):
                     raise self._wrong(f"an answer of at most {scaled(LARGEST):,} bytes", "a longer one")
-                if time.monotonic() > end:
-                    raise TimeoutError(f"no answer within {self.limits['seconds']:g} seconds")
         text = b"".join(parts)
         try:
             answer = parse_json(text.decode(), finite=True)

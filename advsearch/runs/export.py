@@ -17,7 +17,7 @@ from typing import IO, Any, TypeGuard
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.files import JsonObject, JsonValue, open_regular, parse_json, read_text
 from advsearch.options import NOT_A_NUMBER, Value
-from advsearch.runs.files import placed_by, replacing, write_bytes, write_text
+from advsearch.runs.files import check_free_folder, placed_by, replacing, write_bytes, write_text
 from advsearch.runs.store import Row, Store
 
 FORMATS = ("csv", "json", "parquet")
@@ -135,8 +135,7 @@ def write_threedb(rows: Callable[[], Iterable[Row]], out: Path, picture: Callabl
     """Write the rows of a sweep as such a folder, made or empty, with the PNG of each, where one was kept, and return
     how many there were. ``loss`` is the margin with its sign turned: over 0 where a prediction is not right. The
     parameter ``network`` tells what several networks predict apart."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"out: {out} is there already and not empty; name another folder")
+    check_free_folder(out, "out")
     names, classes = dict[str, None](), dict[str, int | None]()
     for row in rows():
         names |= dict.fromkeys(name for name in row.values if name not in _PLACED)

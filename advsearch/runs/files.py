@@ -8,8 +8,10 @@ import errno
 import fcntl
 import io
 import os
+import re
 import sqlite3
 import stat
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from functools import cache
@@ -89,6 +91,15 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+def check_free_folder(out: Path, setting: str) -> None:
+    """Check that a folder that is to be written whole is not there, or is empty. Raises InputError, also of a link: a
+    folder takes the place of no link, and what it leads to may be somebody else's."""
+    if os.path.islink(out):
+        raise InputError(f"{setting}: expected a new or an empty folder, got the link {out}; name the folder itself")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{setting}: {out} is there already and not empty; name another folder")
 
 
 def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> Path:
@@ -199,6 +210,7 @@ def is_held(folder: Path) -> bool:
 
 DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run again"
 LARGEST = 64 << 30
+MAX_SCHEMA_ENTRIES = 100  # of a results.sqlite that are looked at; ours has fewer than ten
 APPLICATION_ID = 0x41445653  # in the header of every results.sqlite that is ours: "ADVS"
 VERSION = 9
 """Of the tables; in the header of the file. Files of another version are read by the advsearch that wrote them."""
@@ -291,17 +303,35 @@ def check_schema(db: sqlite3.Connection, path: Path) -> None:
 
 
 @cache
-def _own_schema() -> frozenset[Any]:
+def _own_schema() -> Counter[Any]:
     with closing(sqlite3.connect(":memory:")) as db:
         db.executescript(SCHEMA)
         return _schema(db)
 
 
-def _schema(db: sqlite3.Connection) -> frozenset[Any]:
-    """Return the tables and the like, and the columns of the rows; a column that is computed is another one."""
-    parts = db.execute("SELECT type, name FROM sqlite_master WHERE name NOT LIKE 'sqlite%'").fetchall()
-    columns = db.execute("PRAGMA table_xinfo(evaluations)").fetchall()
-    return frozenset([*parts, *((name, kind, hidden) for _, name, kind, *_, hidden in columns)])
+def _schema(db: sqlite3.Connection) -> Counter[Any]:
+    """Return every entry of the schema, whatever its name: type, name, table and statement.
+
+    Statements are compared without comments and line breaks, which mean nothing to SQLite.
+    """
+    entries = db.execute("SELECT type, name, tbl_name, sql FROM sqlite_master").fetchmany(MAX_SCHEMA_ENTRIES)
+    return Counter((*names, None if sql is None else _without_comments(str(sql))) for *names, sql in entries)
+
+
+def _without_comments(statement: str) -> str:
+    without_comments = "\n".join(line.partition("--")[0] for line in statement.split("\n"))
+    return re.sub("[ \n]+", " ", without_comments).strip(" ")
+
+
+def _protect(db: sqlite3.Connection) -> None:
+    """Let a stranger's file call no function of its own choosing, and let SQLite look at each page that it reads.
+
+    Nothing here needs the schema, so nothing of the file's own statements has run by then.
+    """
+    db.execute("PRAGMA trusted_schema = OFF")
+    db.execute("PRAGMA writable_schema = OFF")
+    db.execute("PRAGMA cell_size_check = ON")
+    db.execute("PRAGMA mmap_size = 0")
 
 
 def connect_to_write(path: Path) -> sqlite3.Connection:
@@ -312,7 +342,8 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
     _check_journal(path.with_name(f"{path.name}-journal"))
     with storage_errors(path):
         db = sqlite3.connect(path)
-        if _version(db) == 0:  # there is nothing in it to lose yet, so the disk isn't waited for
+        _protect(db)
+        if _version(db) == 0 and not _schema(db):  # there is nothing in it to lose yet, so the disk isn't waited for
             db.execute("PRAGMA synchronous = OFF")
             db.execute(f"PRAGMA application_id = {APPLICATION_ID}")  # before the log, so that the file itself has it
             db.execute("PRAGMA journal_mode = WAL")
@@ -341,6 +372,7 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
     except sqlite3.OperationalError:
         db.close()
         db = sqlite3.connect(f"{address}?immutable=1", uri=True)
+    _protect(db)
     return db
 
 

@@ -43,7 +43,7 @@ from advsearch.scene.parts import (
 from advsearch.scene.places.quads import FLOOR
 from advsearch.scene.rig import Mount, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
-from advsearch.scene.things import ThingPart, with_things
+from advsearch.scene.things import ThingPart, with_solids_checked, with_things
 
 DEFAULT_ENVIRONMENT = "studio"
 OBJECT = "object"  # the name of the mesh under test
@@ -370,7 +370,8 @@ def describe(
         camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
         metered=not mitsuba,
     )  # fmt: skip
-    described = with_lamps(with_things(on_its_ground(described), things, lambda spec: _object(spec, None)))
+    described = with_things(on_its_ground(described), things, lambda spec: _object(spec, None))
+    described = with_lamps(with_solids_checked(described))
     check_meshes(described, values)
     idle = [name for name in given if name.startswith("material.")]
     if described.object.surface is not None and idle:

@@ -236,6 +236,12 @@ def view_of(scene: SceneDescription, to_world: Doubles | None = None, fov: float
     return CameraView(azimuth, towards, math.hypot(x, y), float(z), lowest)
 
 
+def place_of(view: CameraView) -> Doubles:
+    """Return where a camera is, (3,) metres, with the object at the origin."""
+    azimuth = math.radians(view.azimuth)
+    return np.array([view.distance * math.cos(azimuth), view.distance * math.sin(azimuth), view.height])
+
+
 def past(scene: SceneDescription, views: Sequence[CameraView], *, turns: bool = False) -> tuple[str, ...]:
     """Return what is said where views of a scene, at least one, go past what its environment's picture is valid for;
     `turns`: that is turned from view to view."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,14 @@ class ScenePart:
     volumetric: ClassVar[bool] = False  # needs an integrator that handles media
 
 
+class Footprint(NamedTuple):
+    """What something takes up: its convex outline on the ground, corners (K, 2), and between which heights."""
+
+    outline: Doubles
+    low: float
+    high: float
+
+
 @dataclass(frozen=True, eq=False)
 class MeshPart(Shape, ScenePart):
     """A shape in the scene; "object" is the object itself.
@@ -48,6 +56,7 @@ class MeshPart(Shape, ScenePart):
 
     to_world: Doubles = field(default_factory=lambda: np.eye(4))  # (4, 4) its base pose
     laid: bool = False  # it belongs to the ground that the scene has by itself, and goes with it
+    solids: tuple[Footprint, ...] = ()  # of what is laid: what nothing else can be in, in object sizes
 
 
 @dataclass(frozen=True, eq=False)

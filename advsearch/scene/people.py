@@ -8,7 +8,9 @@ turns about the body's own axes (x ahead, y to its left, z up), from the pelvis 
 ground. `scenes/person.py` makes the data.
 
 Walking adds a gait's mean angles over its cycle, as measured of adults (Winter 1991, "The Biomechanics and Motor
-Control of Human Gait", chapter 2), rounded, by a Fourier series.
+Control of Human Gait", chapter 2), rounded, by a Fourier series. Whoever has other proportions would hover with the
+foot that they stand on, or drag the other through the ground. So a walker's legs are made a little longer or shorter,
+between hip and ankle, until each foot in stance touches the ground.
 """
 
 from __future__ import annotations
@@ -57,26 +59,31 @@ LIMBS = (
     ("shoulder_out", -5.0, 160.0, "arm, raised to the side"),
     ("shoulder_turn", -60.0, 80.0, "arm, turned inwards about itself"),
     ("elbow", 0.0, 145.0, "forearm, bent"),
-    ("hip", -15.0, 110.0, "thigh, raised ahead"),
+    ("hip", -25.0, 110.0, "thigh, raised ahead"),
     ("hip_out", -10.0, 40.0, "thigh, to the side"),
     ("knee", 0.0, 130.0, "calf, bent"),
     ("ankle", -35.0, 20.0, "foot, its toes up"),
 )
 """Joints that are there twice, with their limits in degrees."""
-_JOINTS = (
+_JOINTS = tuple(
     _angle(f"{side}_{name}", low, high, f"{side.capitalize()} {text}.")
     for side in ("left", "right")
     for name, low, high, text in LIMBS
 )
 PARAMETERS = (*PHENOTYPE, *WALK, *SPINE, *_JOINTS)  # everything that a person can be asked for
 GAIT = {
-    "hip": (30, 24, 16, 6, -3, -10, -6, 10, 25, 31),
+    "hip": (21, 15, 7, -3, -12, -19, -15, 1, 16, 22),
     "knee": (4, 16, 15, 8, 4, 10, 36, 60, 50, 15),
     "ankle": (0, -5, 3, 7, 10, 7, -15, -10, 0, 2),
     "shoulder": (-20, -17, -8, 4, 14, 18, 15, 6, -6, -16),
     "elbow": (8, 10, 15, 22, 27, 30, 27, 22, 15, 10),
 }
-"""Mean angles in degrees at each tenth of a cycle from the heel strike of the same side."""
+"""Mean angles in degrees at each tenth of a cycle from the heel strike of the same side. The hip's are those of the
+thigh against the vertical: 9 degrees less than against the pelvis, which is tilted ahead."""
+STANCE, LIFTED, LOWERED = 216.0, 252.0, 324.0
+"""Degrees of a cycle at which the toes of a foot leave the ground, from which it swings, and from which it comes down;
+at 360 its heel strikes."""
+FULL_CONTACT_STRIDE = 0.1  # from which on both feet are put onto the ground; below, in proportion
 STRAIGHT = {
     "upperarm": ("lowerarm", (0.02, 0.15, -1.0)), "lowerarm": ("hand", (0.16, 0.05, -1.0)),
     "thigh": ("calf", (0.0, 0.03, -1.0)), "calf": ("foot", (-0.03, 0.0, -1.0)),
@@ -102,6 +109,11 @@ class Person:
             "weights": torch.from_numpy(data["weights"] / data["weights"].sum(axis=1, keepdims=True, dtype=np.float32)),
             "index": torch.from_numpy(data["index"].astype(np.int64)),
         } | {name: torch.from_numpy(data[name]) for name in ("shares", "stature", "mass")}
+        is_shoe = np.repeat(data["tags"], data["points"]) == "shoes"
+        shoe_points = np.unique(data["index"][is_shoe].astype(np.int64))
+        is_left = data["mean"][shoe_points, 1] > 0
+        self._held["shoe_l"] = torch.from_numpy(shoe_points[is_left])
+        self._held["shoe_r"] = torch.from_numpy(shoe_points[~is_left])
         self.standing = self.posed({})
         self.size = float((self.standing.amax(dim=0) - self.standing.amin(dim=0)).max())
 
@@ -120,11 +132,53 @@ class Person:
         joints, points = points[-len(self._bones) :], points[: -len(self._bones)]
         turns, shifts = self._skeleton(joints, walked(number))
         weights = self._on("weights", device)
-        moved = torch.einsum("pj,jk->pk", weights, torch.cat([turns.reshape(-1, 9), shifts], dim=1))
-        posed = torch.einsum("pik,pk->pi", moved[:, :9].reshape(-1, 3, 3), points) + moved[:, 9:]
+        posed = skinned(points, weights, turns, shifts)
+        if bool(number["stride"] > 0.0):
+            raised = self._leg_corrections(points, joints, number)
+            posed = self._with_legs_corrected(posed, turns, shifts, joints, raised)
         pelvis = shifts[0] + turns[0] @ joints[0]
         floor = torch.cat([pelvis[:2], posed[:, 2].amin()[None]])
         return (factor * (posed - floor)).index_select(0, self._on("index", device))
+
+    def _leg_corrections(self, points: Tensor, joints: Tensor, number: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return by how much each foot has to rise, by its side, so that a foot in stance is on the ground.
+
+        They are those of the walk alone: what else is asked of the joints is left as it is.
+        """
+        walk_alone = {**number, **{one.name: torch.zeros_like(number["walk"]) for one in (*SPINE, *_JOINTS)}}
+        turns, shifts = self._skeleton(joints, walked(walk_alone))
+        weights = self._on("weights", points.device)
+        lowest = dict[str, Tensor]()
+        contact = dict[str, Tensor]()
+        for side, begin in (("l", 0.0), ("r", 180.0)):
+            shoe = self._on(f"shoe_{side}", points.device)
+            lowest[side] = skinned(points[shoe], weights[shoe], turns, shifts)[:, 2].amin()
+            contact[side] = contact_of(number["walk"] + begin)
+        ground = (contact["l"] * lowest["l"] + contact["r"] * lowest["r"]) / (contact["l"] + contact["r"])
+        amount = (number["stride"] / FULL_CONTACT_STRIDE).clamp(max=1.0)
+        raised = dict[str, Tensor]()
+        for side, height in lowest.items():
+            clearance = (height - ground).clamp(min=0.0) * (1.0 - contact[side])
+            raised[side] = amount * (ground + clearance - height)
+        return raised
+
+    def _with_legs_corrected(
+        self, posed: Tensor, turns: Tensor, shifts: Tensor, joints: Tensor, raised: Mapping[str, Tensor]
+    ) -> Tensor:
+        """Return posed points (P, 3) whose feet have risen, and what is between hip and ankle in proportion."""
+        weights = self._on("weights", posed.device)
+        rise = torch.zeros_like(posed[:, 2])
+        for side, foot_rise in raised.items():
+            thigh, calf, foot = (self._bones.index(f"{bone}_{side}") for bone in ("thigh", "calf", "foot"))
+            hip_height = (turns[thigh] @ joints[thigh] + shifts[thigh])[2]
+            ankle_height = (turns[foot] @ joints[foot] + shifts[foot])[2]
+            below_hip = ((hip_height - posed[:, 2]) / (hip_height - ankle_height)).clamp(0.0, 1.0)
+            of_foot = sum(weights[:, index] for index in self._foot_bones(foot))
+            rise = rise + foot_rise * (of_foot + (weights[:, thigh] + weights[:, calf]) * below_hip)
+        return torch.cat([posed[:, :2], (posed[:, 2] + rise)[:, None]], dim=1)
+
+    def _foot_bones(self, foot: int) -> list[int]:
+        return [foot, *(index for index, parent in enumerate(self._parents) if parent == foot)]
 
     def measured(self, values: Mapping[str, Tensor], clip: str | None = None) -> Mapping[str, Value]:
         mixed, factor = self._phenotype(self._numbers(values))
@@ -200,6 +254,20 @@ def walked(number: Mapping[str, Tensor]) -> dict[str, Tensor]:
     joints = (parameter for parameter in PARAMETERS if parameter.unit == "degrees" and not parameter.periodic)
     limits = {joint.name: (joint.low, joint.high) for joint in joints}
     return {name: value.clamp(*limits[name]) if name in limits else value for name, value in angle.items()}
+
+
+def contact_of(phase: Tensor) -> Tensor:
+    """Return how much a foot is held to the ground, 0 to 1, at degrees of its cycle from its heel strike."""
+    degrees = torch.remainder(phase, 360.0)
+    lifted = ((degrees - STANCE) / (LIFTED - STANCE)).clamp(0.0, 1.0)
+    lowered = ((degrees - LOWERED) / (360.0 - LOWERED)).clamp(0.0, 1.0)
+    return 0.5 + 0.5 * torch.cos(np.pi * (lifted - lowered))
+
+
+def skinned(points: Tensor, weights: Tensor, turns: Tensor, shifts: Tensor) -> Tensor:
+    """Return points (P, 3), moved with bones (J) in the proportions of their weights (P, J): linear blend skinning."""
+    moved = torch.einsum("pj,jk->pk", weights, torch.cat([turns.reshape(-1, 9), shifts], dim=1))
+    return torch.einsum("pik,pk->pi", moved[:, :9].reshape(-1, 3, 3), points) + moved[:, 9:]
 
 
 def turned(angle: Mapping[str, Tensor]) -> dict[str, Tensor]:

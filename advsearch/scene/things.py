@@ -9,11 +9,11 @@ left. A heading is in degrees counter-clockwise, seen from above; at 0 a thing f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -22,7 +22,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import LARGEST, SMALLEST, Doubles, ObjectAsset, doubts, footing, pose_of, sized
 from advsearch.scene.geometry import middle, rotation, standing
 from advsearch.scene.importing.files import safe_name
-from advsearch.scene.parts import MeshPart, mesh_part
+from advsearch.scene.parts import Footprint, MeshPart, mesh_part
 from advsearch.scene.places.quads import LAID
 from advsearch.scene.settings import LAMPS
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 FARTHEST = 1000.0  # how far from the object a thing may stand, metres
 MOST = 64  # things beside an object
+EYE_SIZE = 1e-3  # half the width of what stands for a camera, object sizes
 OPTIONS = ("heading", "size", "name", "label", "lamps")
 ALL = "all"  # what stands for the object and every thing beside it
 TAKEN = ("object", "environment", "ground", "camera", *LAID, ALL)  # what a thing can't be called
@@ -170,14 +171,6 @@ def heights_over(corners: Doubles, place: Doubles) -> list[float]:
     return heights
 
 
-class Footprint(NamedTuple):
-    """What something takes up: its convex outline on the ground, corners (K, 2), and between which heights."""
-
-    outline: Doubles
-    low: float
-    high: float
-
-
 def footprint(points: Doubles) -> Footprint:
     """Return what a cloud of points (N, 3) takes up."""
     corners = ConvexHull(points[:, :2], qhull_options="QJ").vertices
@@ -188,6 +181,56 @@ def overlapping(one: Footprint, other: Footprint) -> bool:
     """Return whether two outlines overlap, at heights that both have."""
     begin, end = blocked(one, other, np.array([1.0, 0.0]))
     return begin < 0.0 < end
+
+
+SOLID_NAMES = {
+    "houses": "a house", "posts": "a lamp post", "trees": "the trunk of a tree", "sign-post": "the post of a sign",
+    "walls": "a wall", "furniture": "a piece of furniture",
+}  # fmt: skip
+"""What the solids of a place's meshes are called."""
+
+
+def solid_at(scene: SceneDescription, taken: Footprint) -> str | None:
+    """Return which solid of the scene's place something overlaps with, such as "a house"; None where it stands free."""
+    for name, part in scene.around.items():
+        if any(overlapping(solid, taken) for solid in part.solids):
+            return SOLID_NAMES[name]
+    return None
+
+
+def with_solids_checked(scene: SceneDescription) -> SceneDescription:
+    """Return the scene with a remark on its object and each thing that stands in a house, a post or the like."""
+    if not any(part.solids for part in scene.around.values()):
+        return scene
+    taken = {"the object": footprint(scene.base_vertices)}
+    taken |= {name: footprint(standing(scene.meshes[name])) for name in scene.things}
+    remarks = list[str]()
+    for name, outline in taken.items():
+        solid = solid_at(scene, outline)
+        if solid is not None:
+            remarks.append(f"{name[0].upper()}{name[1:]} stands in {solid} of the place around it: put it elsewhere.")
+    return replace(scene, remarks=(*scene.remarks, *remarks))
+
+
+def camera_remarks(scene: SceneDescription, eyes: Sequence[Doubles]) -> tuple[str, ...]:
+    """Return what is said where cameras, at places (3,) in metres, are inside a solid of the scene's place."""
+    inside = list[str]()
+    for eye in eyes:
+        x, y, z = eye / scene.metres
+        around = np.array([(x - EYE_SIZE, y), (x, y - EYE_SIZE), (x + EYE_SIZE, y), (x, y + EYE_SIZE)])
+        solid = solid_at(scene, Footprint(around, z - EYE_SIZE, z + EYE_SIZE))
+        if solid is not None:
+            inside.append(solid)
+    if not inside:
+        return ()
+    if len(eyes) == 1:
+        return (f"The camera is inside {inside[0]} of the place: it sees no object from there; move it.",)
+    solids = " or ".join(dict.fromkeys(inside))
+    fraction = 100.0 * len(inside) / len(eyes)
+    return (
+        f"The camera is inside {solids} of the place in {fraction:.0f} % of the views: it sees no object from there; "
+        "narrow where it goes.",
+    )
 
 
 def blocked(one: Footprint, other: Footprint, way: Doubles) -> tuple[float, float]:

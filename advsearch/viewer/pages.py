@@ -162,9 +162,12 @@ def page_of(run: Path, result: Result) -> str:
 
 
 def keep_result(run: RunDirectory, result: AnyResult) -> AnyResult:
-    """Write the summary and the page of a result into the open directory of its run, and return it."""
-    run.write_summary(result)
+    """Write the page and the summary of a result into the open directory of its run, and return it.
+
+    The summary is the last file: a run whose disk was full before is not done, and goes on.
+    """
     write_page(run.path, result)
+    run.write_summary(result)
     return result
 
 

@@ -15,7 +15,8 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.sweep.axes import on_grid, read_axes
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.things import Footprint, footprint, overlapping
+from advsearch.scene.parts import Footprint
+from advsearch.scene.things import footprint, overlapping
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -27,6 +28,22 @@ CLOSE = 2e-4
 @pytest.fixture(scope="module")
 def scene() -> SceneDescription:
     return describe("car", things=THINGS, given={"camera.distance": 9.0})
+
+
+def test_a_thing_that_moves_stays_out_of_houses_and_posts() -> None:
+    street = describe("car", "avenue", things="person@-15,-6", given={"camera.distance": 9.0})
+    space = space_of(street, {"x": [-0.1, 0.1], "y": [-12.0, 3.0], "heading": [0, 1]})
+    solids = [solid for part in street.around.values() for solid in part.solids]
+    for u in torch.rand(40, len(space.start), generator=torch.Generator().manual_seed(1)):
+        inputs = space.inputs(u)
+        assert space.scene is not None
+        mesh = space.scene.meshes["person"].mesh.vertices
+        pose = inputs["person.to_world"].double().numpy()
+        taken = footprint(mesh @ pose[:3, :3].T + pose[:3, 3])
+        assert not any(overlapping(solid, taken) for solid in solids)
+    post = describe("car", "avenue", things="person@-15,-3.05")
+    with pytest.raises(InputError, match="person stands in something else; put it elsewhere"):
+        space_of(post, {"x": [-1.0, 1.0]})
 
 
 def space_of(scene: SceneDescription, settings: dict[str, Any] | None = None, **others: Any) -> Space:

@@ -9,7 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -229,6 +229,64 @@ def test_nobody_there_a_slow_one_and_one_that_drips(server: Server) -> None:
     with pytest.raises(ModelError, match="timed out"):
         ask_of(server, seconds=0.05)
     assert len(server.came) == address.TRIES
+
+
+DRIPS = {
+    "a status": (b"", b"H"),
+    "a header": (b"HTTP/1.1 200 OK\r\nA: ", b"a"),
+    "headers": (b"HTTP/1.1 200 OK\r\n", b"a: b\r\n"),
+    "promises": (b"", b"HTTP/1.1 100 Continue\r\n\r\n"),
+    "a body": (b"HTTP/1.1 200 OK\r\n\r\n{", b" "),
+    "the length of a chunk": (b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n", b"0"),
+    "a failure": (b"HTTP/1.1 500 No\r\n\r\n", b" "),
+    "a redirect": (b"HTTP/1.1 302 Found\r\nLocation: http://127.0.0.1/\r\n", b"a: b\r\n"),
+}
+
+
+@contextmanager
+def dripping(begun: bytes, more: bytes) -> Iterator[int]:
+    """A server that says a little now and then, for 20 seconds, and no end; its port."""
+    done = threading.Event()
+
+    def drip(connection: socket.socket) -> None:
+        with connection, suppress(OSError):
+            connection.sendall(begun)
+            for _ in range(1000):
+                connection.sendall(more)
+                if done.wait(0.02):
+                    break
+
+    def accept(listening: socket.socket) -> None:
+        with suppress(OSError):
+            while True:
+                threading.Thread(target=drip, args=listening.accept()[:1], daemon=True).start()
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=accept, args=(listening,), daemon=True).start()
+        try:
+            yield listening.getsockname()[1]
+        finally:
+            done.set()
+            listening.shutdown(socket.SHUT_RDWR)
+
+
+@pytest.mark.parametrize("case", DRIPS)
+def test_an_answer_has_its_time_in_all(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever drips, the model is given up after `seconds`, and no thread goes on waiting."""
+    monkeypatch.setattr(address, "TRIES", 1)
+    monkeypatch.delenv(KEY, raising=False)
+    with dripping(*DRIPS[case]) as port:
+        model = advsearch.load_model(f"http://127.0.0.1:{port}", task="answer", ask={"seconds": 0.3})
+        began = time.monotonic()
+        with pytest.raises(ModelError, match=r"timed out: no answer within 0\.3 seconds"):
+            model(torch.zeros((8, 8, 3)))
+        assert time.monotonic() - began < 5.0
+        for _ in range(100):
+            waiting = [one for one in threading.enumerate() if one.name.startswith("ThreadPoolExecutor")]
+            if not waiting:
+                break
+            time.sleep(0.05)
+        assert not waiting
 
 
 def test_the_key_is_in_no_message(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:

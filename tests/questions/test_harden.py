@@ -6,6 +6,7 @@ import json
 import shutil
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -214,7 +215,11 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
             judged_at.clear()
             net.load_state_dict({name: one + 1.0 for name, one in given.items()})
             rounds = Rounds(run, course_of(config.model_copy(update={"clean_loss": loss}), net))
+            advanced = list[int]()
+            watcher: Any = SimpleNamespace(advance=lambda n, worst, told=advanced: told.append(n))
+            rounds.progress = watcher
             found, part = rounds.mixed([])
+            assert sum(advanced) == looked_at, "whoever watches sees each part of the way"
             assert part == expected and found.robust == pytest.approx(0.5 + 0.2 * part)
             assert len(judged_at) == looked_at, "less than the best part is looked at once"
             torch.testing.assert_close(net.bias.detach(), given["bias"] + part)

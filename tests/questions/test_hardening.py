@@ -38,7 +38,7 @@ from advsearch.questions.harden.lessons import (
     tried,
 )
 from advsearch.questions.harden.result import HardenConfig, TrainingRound
-from advsearch.questions.harden.rounds import Rounds, Score
+from advsearch.questions.harden.rounds import Rounds, Score, warm_up_fraction
 from advsearch.questions.harden.scenes import (
     HELD_OUT,
     TRAINING,
@@ -276,6 +276,19 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     more = [Lesson((5,), levels_of(coloured(0, 0.4, 1)))] * 24  # nothing makes them harder
     assert course.score([*lessons, *more]) == Score(after.clean / 2, after.robust)
     assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
+
+
+@pytest.mark.parametrize("fraction", [0.1, 0.2, 0.25, 0.3])
+def test_a_training_of_few_steps_has_a_rate_for_each(fraction: float) -> None:
+    for n_rates in range(2, 41):
+        optimiser = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))], 1.0)
+        rates = torch.optim.lr_scheduler.OneCycleLR(
+            optimiser, 1.0, total_steps=n_rates, pct_start=warm_up_fraction(fraction, n_rates), cycle_momentum=False
+        )
+        for _ in range(n_rates - 1):
+            optimiser.step()
+            rates.step()
+            assert 0.0 < rates.get_last_lr()[0] <= 1.0
 
 
 def test_to_judge_a_model_leaves_the_lessons_as_they_are() -> None:

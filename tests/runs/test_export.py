@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import json
 import math
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,12 +17,13 @@ from samples import attack, rated
 
 from advsearch.cli.export import WRITERS
 from advsearch.cli.main import main
-from advsearch.errors import UnknownNameError
+from advsearch.errors import StorageError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import FORMATS, as_columns, write_rows
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.store import NAME, Row, Store
+from advsearch.viewer.pages import keep_result
 
 TWO: Any = {"light.place": {"value": [1.0, 2.0], "unit": ""}}
 """A value of two numbers; our own controls have none such."""
@@ -169,6 +172,55 @@ def test_no_runs_and_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.chdir(tmp_path)
     assert main(["runs"]) == 0 and "no runs in runs/ yet" in capsys.readouterr().out
     assert main(["runs", "nowhere"]) == 2 and "nowhere: expected a folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("full_at", ["report.html", "summary.json"])
+def test_a_run_whose_disk_was_full_at_the_end_goes_on_and_has_everything(
+    full_at: str, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replace = os.replace
+
+    def full(source: Path, target: Path) -> None:
+        if Path(target).name == full_at:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(source, target)
+
+    result = attack(verified=None)
+    with monkeypatch.context() as patched:
+        patched.setattr("advsearch.runs.files.os.replace", full)
+        with RunDirectory.resume("one") as again, pytest.raises(StorageError, match="the disk is full"):
+            keep_result(again, result)
+    assert not finished(run) and not (run / full_at).exists() and not list(run.glob(".part-*"))
+    with RunDirectory.resume("one") as again:
+        keep_result(again, result)
+    assert finished(run) and (run / "report.html").is_file()
+
+
+def test_resume_makes_the_page_again_that_is_missing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RunDirectory.resume("one") as again:
+        keep_result(again, attack(verified=None))
+    (run / "report.html").unlink()
+    assert main(["resume", "one"]) == 0 and "is done already" in capsys.readouterr().err
+    assert b"<html" in (run / "report.html").read_bytes()
+
+
+@pytest.mark.parametrize("leads_to", ["an empty folder", "nothing"])
+@pytest.mark.parametrize("format", ["coco", "yolo", "mitsuba", "projector", "3db"])
+def test_an_export_goes_to_no_link(
+    format: str, leads_to: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with RunDirectory.resume("one") as again:
+        keep_result(again, attack(verified=None))
+    target = tmp_path / "target"
+    if leads_to == "an empty folder":
+        target.mkdir()
+    link = tmp_path / "link"
+    link.symlink_to(target)
+    assert main(["export", "one", "--format", format, "--out", str(link)]) == 2
+    error = capsys.readouterr().err
+    assert "link" in error.splitlines()[-1] and error.splitlines()[-1].startswith("advsearch: error: --out: ")
+    assert link.is_symlink() and (not target.exists() or not list(target.iterdir()))
+    assert not list(tmp_path.glob(".export-*"))
 
 
 def test_resume_of_a_run_that_is_done_shows_its_result(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -55,6 +55,19 @@ def statement(text: str) -> Callable[[Path], None]:
     return change
 
 
+def edited_schema(text: str) -> Callable[[Path], None]:
+    """Change the schema past SQLite's own checks: a name that begins with sqlite_ is reserved, but can be written."""
+    return statement(f"PRAGMA writable_schema = ON; {text}; PRAGMA writable_schema = RESET")
+
+
+def made_internal(kind: str, made: str) -> Callable[[Path], None]:
+    """Make a trigger, a view, ... called `it`, and give it a name that begins like SQLite's own."""
+    renamed = f"sql = replace(sql, '{kind} it', '{kind} sqlite_it'), name = 'sqlite_it'"
+    if kind in ("TABLE", "VIEW"):
+        renamed += ", tbl_name = 'sqlite_it'"
+    return edited_schema(f"CREATE {kind} it {made}; UPDATE sqlite_master SET {renamed} WHERE name = 'it'")
+
+
 def content(name: str, data: bytes) -> Callable[[Path], object]:
     return lambda folder: (folder / name).write_bytes(data)
 
@@ -90,6 +103,28 @@ STORES: dict[str, Callable[[Path], object]] = {
     "a label that is bytes": statement("UPDATE evaluations SET label = x'ff'"),
     "text that is not UTF-8": statement("UPDATE evaluations SET label = CAST(x'ff' AS TEXT)"),
     "a trigger": statement("CREATE TRIGGER t AFTER INSERT ON evaluations BEGIN DELETE FROM evaluations; END"),
+    "a trigger with an internal name": made_internal(
+        "TRIGGER", "AFTER INSERT ON evaluations BEGIN DELETE FROM evaluations; END"
+    ),
+    "a view with an internal name": made_internal("VIEW", "AS SELECT 1"),
+    "a table with an internal name": made_internal("TABLE", "(a)"),
+    "an index with an internal name": made_internal("INDEX", "ON meta (upper(value))"),
+    "a trigger called like a table": statement(
+        "CREATE TRIGGER told AFTER INSERT ON evaluations BEGIN DELETE FROM evaluations; END"
+    ),
+    "a virtual table": statement("CREATE VIRTUAL TABLE words USING fts5(text)"),
+    "another table": statement("CREATE TABLE more (a)"),
+    "statistics of the planner": statement("ANALYZE"),
+    "an index on an expression": statement("CREATE INDEX likely ON evaluations (abs(step))"),
+    "a column that is checked": edited_schema(
+        "UPDATE sqlite_master SET sql = replace(sql, 'step         INTEGER NOT NULL', "
+        "'step INTEGER NOT NULL CHECK (step > 0)') WHERE name = 'evaluations'"
+    ),
+    "a default of its own": edited_schema(
+        "UPDATE sqlite_master SET sql = replace(sql, 'label        TEXT', 'label TEXT DEFAULT (randomblob(9))') "
+        "WHERE name = 'evaluations'"
+    ),
+    "tables without a version": statement("PRAGMA user_version = 0"),
     "a view without an end": statement(
         "DROP TABLE evaluations; CREATE VIEW evaluations AS WITH RECURSIVE t(id) AS "
         "(SELECT 1 UNION ALL SELECT id + 1 FROM t) SELECT * FROM t"

@@ -13,10 +13,18 @@ from advsearch.scene.grounds import LUMINANCE, enclosed, paved
 from advsearch.scene.places.avenue import AVENUE, END, KERB, LAMP_HEIGHT, lamp_places
 from advsearch.scene.places.paint import FRONTS
 from advsearch.scene.places.quads import KERBS, ROAD, SHOWN, Quads, Wall
+from advsearch.scene.things import ground_height
 
 
 def laid(scene: SceneDescription) -> set[str]:
     return {name for name, part in scene.around.items() if part.laid}
+
+
+def test_kerbs_are_as_high_as_the_page_says() -> None:
+    """12 cm, docs/scenes.md: a pavement lies that much above the road."""
+    scene = describe("car", "avenue")
+    heights = [ground_height(scene, np.array([0.0, y]) / scene.metres) * scene.metres for y in (0.0, -4.0, 8.0)]
+    assert heights == pytest.approx([0.0, 0.12, 0.12], abs=1e-4)
 
 
 def test_an_avenue_comes_and_goes_with_its_ground() -> None:

@@ -52,6 +52,16 @@ def test_under_uniform_light_the_card_gets_its_level() -> None:
     assert scene.gain * WHITE * 2.5 == pytest.approx(METERED_WHITE, rel=0.01)
 
 
+@pytest.mark.parametrize(("ev", "stops"), [(14.0, 0.0), (3.0, 0.0), (14.0, -1.5)])
+def test_an_exposure_value_says_which_luminance_is_white(ev: float, stops: float) -> None:
+    """As docs/scenes.md has it: linear value = L / (1.2 * 2 ** ev) * 2 ** exposure, with L in cd/m2."""
+    scene = describe("car", "avenue", given={"camera.ev": ev, "camera.exposure": stops})
+    assert scene.environment is not None and scene.environment.candelas is not None
+    white = 1.2 * 2.0**ev / 2.0**stops  # cd/m2
+    assert scene.gain * white / scene.environment.candelas == pytest.approx(1.0)
+    assert (ev, stops) != (14.0, 0.0) or white == pytest.approx(19661, abs=1)
+
+
 def test_a_black_environment_meters_to_one() -> None:
     assert grey_ball(EnvironmentAsset("night", np.zeros((8, 16, 3), np.float32))).gain == 1.0
 

@@ -50,6 +50,44 @@ def test_a_walker_stays_on_the_ground_and_upright(walk: int) -> None:
     assert shoes[:, 2].min() < 1e-6, "something else than a shoe touches the ground"
 
 
+SOMEBODY = (
+    {}, {"gender": 0.0}, {"weight": 1.0, "age": 80.0}, {"age": 12.0, "height": 1.3}, {"height": 2.0, "gender": 0.3}
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("stride", [0.1, 0.6, 1.0, 1.3])
+@pytest.mark.parametrize("more", SOMEBODY)
+def test_each_foot_in_stance_is_on_the_ground(more: dict[str, float], stride: float) -> None:
+    """From the strike of its heel until its toes leave the ground, at 60 % of its cycle; the other goes through no
+    ground, and swings free in the middle of an ordinary step."""
+    for walk in range(0, 360, 18):
+        vertices = PERSON.posed(numbers(walk=walk, stride=stride, **more))
+        for begin, ahead in ((0.0, vertices[:, 1] > 0), (180.0, vertices[:, 1] < 0)):
+            of_shoe = np.repeat(PERSON.data["tags"], PERSON.data["points"]) == "shoes"
+            height = float(vertices[torch.from_numpy(of_shoe) & ahead, 2].min())
+            own_phase = (walk + begin) % 360
+            assert height >= -1e-6
+            assert own_phase > 216 or height < 1e-3, (walk, begin)
+            assert stride < 1.0 or own_phase != 270 or height > 0.02
+
+
+def test_legs_of_a_walker_stay_as_long_as_they_are() -> None:
+    """What puts the feet onto the ground is a small part of a leg; without a stride nothing is moved."""
+    for stride, most in ((0.0, 0.0), (0.6, 0.04), (1.0, 0.04), (1.3, 0.1)):
+        raised = list[float]()
+        for walk in range(0, 216, 18):
+            values = PERSON._numbers(numbers(walk=walk, stride=stride))
+            points = PERSON._held["mean"] + torch.einsum(
+                "r,rpc->pc",
+                torch.einsum("gawh,gawhr->r", PERSON._phenotype(values)[0], PERSON._held["shares"]),
+                PERSON._held["basis"],
+            )
+            bones = len(PERSON._bones)
+            rise = PERSON._leg_corrections(points[:-bones], points[-bones:], values)
+            raised.append(abs(float(rise["l"])))
+        assert max(raised) <= most, (stride, max(raised))
+
+
 def test_a_turn_of_the_walk_is_the_same_with_the_sides_exchanged() -> None:
     left, right = (walked(PERSON._numbers(numbers(walk=walk, stride=1.0))) for walk in (40.0, 220.0))
     for joint in GAIT:

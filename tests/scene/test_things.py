@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from scipy import ndimage
 
 import advsearch
 from advsearch.cli.main import main
+from advsearch.controls import make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import things_as_text
 from advsearch.scene import library
@@ -86,6 +88,58 @@ def test_what_stands_in_another_thing_is_said() -> None:
 
 SQUARE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 TURNED = SQUARE @ np.array([[0.7, 0.7, 0.0], [-0.7, 0.7, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("environment", "thing", "solid"),
+    [
+        ("avenue", "car@0,17", "a house"),
+        ("avenue", "car@-9,-14,heading=90", "a house"),
+        ("avenue", "person@-15,-3.05", "a lamp post"),
+        ("avenue", "person@-15,-4.4", "the trunk of a tree"),
+        ("avenue", "person@-15,-6", None),
+        ("avenue", "car@10,3.5", None),
+    ],
+)
+def test_what_stands_in_a_house_or_a_post_of_a_place_is_said(environment: str, thing: str, solid: str | None) -> None:
+    remarks = describe("car", environment, things=f"{thing},name=it").remarks
+    expected = () if solid is None else (f"It stands in {solid} of the place around it: put it elsewhere.",)
+    assert remarks == expected
+
+
+@pytest.mark.parametrize("kind", ["avenue", "crossing", "car-park"])
+def test_solids_of_a_place_are_where_its_meshes_are(kind: str) -> None:
+    """Each post, trunk and house has some of its mesh's vertices at its outline, and the object stands free."""
+    scene = describe("car", "overcast", given={"ground.kind": kind})
+    assert not scene.remarks
+    for part in scene.around.values():
+        vertices = standing(part)
+        for solid in part.solids:
+            low = solid.outline.min(axis=0) - 0.05
+            high = solid.outline.max(axis=0) + 0.05
+            near = ((vertices[:, :2] >= low) & (vertices[:, :2] <= high)).all(axis=1)
+            assert near.any() and vertices[near, 2].max() >= solid.high - 0.1, part.name
+
+
+def test_a_room_has_walls_and_shelves_that_nothing_stands_in() -> None:
+    for place, solid in (("0,1.95", "a wall"), ("-1.6,0", "a piece of furniture"), ("0.2,0.3", None)):
+        scene = describe("mug", "kitchen", given={"ground.kind": "room"}, things=f"mug@{place},name=it")
+        assert bool(scene.remarks) == (solid is not None)
+        assert solid is None or solid in scene.remarks[0]
+
+
+def test_a_camera_inside_a_house_is_said_and_how_often_it_is_there() -> None:
+    def notes(given: dict[str, float], **ranges: list[float]) -> tuple[str, ...]:
+        scene = describe("car", "avenue", given=given)
+        control = make_control("camera", dict(ranges)) if ranges else make_control("pose")
+        return make_space([control], scene).notes(scene)
+
+    inside = {"camera.azimuth": 90.0, "camera.distance": 20.0, "camera.elevation": 5.0}
+    (said,) = notes(inside)
+    assert said == "The camera is inside a house of the place: it sees no object from there; move it."
+    assert notes({**inside, "camera.azimuth": 180.0}) == ()
+    (said,) = notes({"camera.elevation": 5.0, "camera.distance": 20.0}, azimuth=[-180.0, 180.0])
+    assert re.search(r"inside a house of the place in [3-6][0-9] % of the views", said)
 
 
 def test_outlines_overlap_where_squares_do() -> None:

@@ -4,6 +4,7 @@ to its weights is kept which is best on scenes that it was not trained on."""
 from __future__ import annotations
 
 import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -102,9 +103,10 @@ class Course(ABC):
         parameters, rate = self.student.parameters(), self.config.rate
         make = self.optimiser or partial(torch.optim.AdamW, lr=rate, weight_decay=self.weight_decay)
         optimiser = make(parameters)
+        n_rates = self.steps(pool) + 1
         rates = torch.optim.lr_scheduler.OneCycleLR(
-            optimiser, [float(group["lr"]) for group in optimiser.param_groups], total_steps=self.steps(pool) + 1,
-            pct_start=self.warm_up, cycle_momentum=False,
+            optimiser, [float(group["lr"]) for group in optimiser.param_groups], total_steps=n_rates,
+            pct_start=warm_up_fraction(self.warm_up, n_rates), cycle_momentum=False,
         )  # fmt: skip
         average, done = [parameter.detach().clone() for parameter in parameters], 0
         rng = np.random.default_rng([seeds.stream(self.config.seed, "order"), number])
@@ -125,6 +127,14 @@ class Course(ABC):
         with torch.no_grad():
             for kept, parameter in zip(average, parameters, strict=True):
                 parameter.copy_(kept)
+
+
+def warm_up_fraction(fraction: float, n_rates: int) -> float:
+    """Return the fraction of the steps in which the rate rises, or a little more where that is a single step.
+
+    OneCycleLR divides by the steps of its rise but one.
+    """
+    return fraction * 1.001 if math.isclose(fraction * n_rates, 1.0) else fraction
 
 
 class Rounds:
@@ -156,6 +166,7 @@ class Rounds:
             pool, begun = list(course.own), 0
             held_back = course.draw("drawing scenes to choose weights by", VALIDATION, range(self.judged))
             if not self.done:
+                self.progress.stage("judging the model as it is")
                 self.keep(0, [], course.score(held_back), 0, 0.0)
             for number in range(1, config.rounds + 1):
                 net.load_state_dict(self._weights(number - 1))
@@ -168,6 +179,7 @@ class Rounds:
                 with threads.all_for_torch():
                     # others are as hard as their training left them
                     course.round(number, pool, pool[begun:], lambda: self.progress.advance(1))
+                    self.progress.stage(f"round {number}: choosing weights", len(PARTS), at_most=True)
                     judged, part = self.mixed(held_back)
                 begun = len(pool)
                 self.keep(number, new, judged, len(pool), part)
@@ -192,6 +204,7 @@ class Rounds:
         for part in PARTS:
             take(part)
             scores[part] = self.course.score(held_back)
+            self.progress.advance(1, worst=scores[part].robust)
             allowed = {part: score.robust for part, score in scores.items() if self._allowed(score.clean)}
             if allowed and [*allowed.values()][-1] < max(allowed.values()):
                 break

@@ -317,10 +317,10 @@ class Sweep:
             command_line=job.config.command_line(),
         )
         if run is not None:
-            run.write_summary(summary)
             for suffix, data in sweep_figure(summary).items():
                 write_bytes(run.path / "images" / f"sweep.{suffix}", data)
             write_sweep_page(run.path, summary)
+            run.write_summary(summary)  # last: without a page the run is not done
         return SweepResult(summary, None if run is None else run.path, tuple(self.journal.rows))
 
     def _changes(self) -> list[results.ChangeRates]:

@@ -24,7 +24,7 @@ from advsearch.report.shown import Html, element, join_html
 from advsearch.report.shown import shown as shown_of
 from advsearch.report.wording import beside_text, prediction_text
 from advsearch.runs import directory
-from advsearch.runs.files import placed_by, write_bytes, write_text
+from advsearch.runs.files import check_free_folder, placed_by, write_bytes, write_text
 from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
 from advsearch.viewer.columns import packed, read_columns
@@ -202,8 +202,7 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     """Write a folder with a page, the rows and the thumbnails of sweeps, or the page of another run; return the page.
     Raises InputError where the folder is there and not empty, or these runs have no common page, and otherwise as
     `write_sweep_page`."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"bundle: {folder} is there already and not empty; name another folder")
+    check_free_folder(folder, "bundle")
     results = [(run, read_result(run)) for run in runs]
     sweeps = [(run, result) for run, result in results if isinstance(result, SweepSummary)]
     with placed_by("bundle"):

@@ -277,8 +277,8 @@ def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bo
         if rows.empty:
             raise FileFormatError(f"{folder}: expected the log of 3DB with at least one line, got an empty one")
         summary = _summary_of(rows, kept.path, folder)
-        kept.write_summary(summary)
         write_sweep_page(kept.path, summary)
+        kept.write_summary(summary)
         return kept.path
 
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from advsearch.scene.assets import Doubles, Floats, Material
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.parts import MeshPart
+from advsearch.scene.parts import Footprint, MeshPart
 from advsearch.scene.places import paint
-from advsearch.scene.places.houses import Fronts
+from advsearch.scene.places.houses import DEPTH, Fronts
 from advsearch.scene.places.quads import DRY, FRONT, KERBS, ROAD, SHOWN, WET, Quads, Wall, shown
 
 END, CROSSING, FAR = 150.0, 12.0, 4000.0  # where the street ends, how wide what it meets is, how far the plain goes
@@ -28,6 +28,7 @@ TREES = (-118.0, -97.0, -76.0, -55.0, -34.0, -15.0, 22.0, 43.0, 64.0, 85.0, 106.
 POSTS = tuple(range(-135, 150, 30))  # x of the lamp posts, to the right and to the left in turn
 POST_AT, TREE_AT = (-3.05, 6.55), (-4.4, 7.9)  # y of the posts and of the trees, on the right and on the left
 LAMP_HEIGHT, ARM = 7.5, 1.7
+POST, TRUNK, TRUNK_HEIGHT = 0.1, 0.14, 2.5  # radii of posts and trunks, and how high a trunk is at least
 LAMP_SIZE = (0.36, 0.22)  # of the area that shines, level
 WALL, PANE, LEAF, IRON = (
     Material(roughness=0.85, specular=0.25), Material(roughness=0.06, specular=0.6),
@@ -95,11 +96,36 @@ def built(
         *((("snow", fallen, white, WALL),) if snow else ()),
     )
     shine = {name: cd[None, None] / np.float32(candelas) for name, cd in LIT.items()} if dark and candelas else {}
+    solids = {
+        "houses": tuple(house_row(row, metres) for row in plan.fronts),
+        "trees": tuple(column(tree.x, tree.y, TRUNK, KERB + TRUNK_HEIGHT, metres) for tree in plan.trees),
+        "posts": tuple(column(x, y, POST, KERB + LAMP_HEIGHT, metres) for x, y, _ in plan.posts),
+    }
     meshes = (
-        MeshPart(name, quads.mesh(metres), base, finish, emission=shine.get(name), laid=True)
+        MeshPart(
+            name, quads.mesh(metres), base, finish,
+            emission=shine.get(name), laid=True, solids=solids.get(name, ()),
+        )
         for name, quads, base, finish in made
-    )
+    )  # fmt: skip
     return (*meshes, *plan.more(metres))
+
+
+def house_row(row: tuple[Wall, float, float, int], metres: float) -> Footprint:
+    """Return what a row of houses takes up, as high as the lowest house, in units of `metres`."""
+    frame, begin, end, _ = row
+    along = np.array([begin, end, end, begin])
+    out = np.array([0.0, 0.0, -DEPTH, -DEPTH])
+    outline = frame.world(along, out, np.zeros(4))[:, :2]
+    height = paint.GROUND_FLOOR + 2.0 * paint.FLOOR
+    return Footprint(outline / metres, 0.0, height / metres)
+
+
+def column(x: float, y: float, radius: float, top: float, metres: float) -> Footprint:
+    """Return what something round takes up, from the ground to its top, in units of `metres`."""
+    turn = np.arange(8) * (np.pi / 4.0)
+    outline = np.array([x, y]) + radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return Footprint(outline / metres, 0.0, top / metres)
 
 
 @lru_cache(maxsize=8)

@@ -75,7 +75,10 @@ def _sign(metres: float) -> tuple[MeshPart, ...]:
     asset = replace(asset, mesh=replace(asset.mesh, faces=asset.mesh.faces[kept], materials=materials))
     sign = mesh_part("sign", asset, place, asset.material)
     grey = np.full((2, 2, 3), 0.45, np.float32)
-    return replace(sign, laid=True), MeshPart("sign-post", post.mesh(metres), grey, avenue.IRON, laid=True)
+    column = avenue.column(*SIGN, 0.035, KERB + SIGN_LOW, metres)
+    return replace(sign, laid=True), MeshPart(
+        "sign-post", post.mesh(metres), grey, avenue.IRON, laid=True, solids=(column,)
+    )
 
 
 def _fronts() -> tuple[tuple[Wall, float, float, int], ...]:

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from advsearch.scene.assets import Doubles, Floats, Material
-from advsearch.scene.parts import MeshPart
+from advsearch.scene.parts import Footprint, MeshPart
 from advsearch.scene.places.paint import _clouds, _grain, tint
 from advsearch.scene.places.quads import FLOOR, FRONT, SHOWN, Quads, Wall, shown
 
@@ -26,6 +26,7 @@ DAY, NIGHT, SHADE = 2600.0, 0.6, 4200.0  # luminance of the window's sky by day 
 USUAL = 1000.0  # luminance of a radiance of 1, cd/m2, where the light has no unit
 STRIP, TEXEL, COLUMNS = 0.5, 0.0125, 96
 """How high each strip of the texture is, how large a texel, and how many there are along a strip of 1.2 m."""
+OUTSIDE = 1000.0  # how far what lies behind a wall reaches
 LONG = TEXEL * COLUMNS
 PLANKS, PLASTER, OAK, WHITE = range(4)
 COLORS = (  # linear reflectance; behind the first five, of books
@@ -58,8 +59,9 @@ def room(metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tup
         ("window", pane, black, VARNISH, outside),
         ("lamp", ceiling, white, MATT, lamp[None, None] if dark else None),
     )
+    solids = {"walls": _solid_walls(metres), "furniture": _solid_furniture(metres)}
     return tuple(
-        MeshPart(name, quads.mesh(metres), base, finish, emission=shine, laid=True)
+        MeshPart(name, quads.mesh(metres), base, finish, emission=shine, laid=True, solids=solids.get(name, ()))
         for name, quads, base, finish, shine in made
     )
 
@@ -94,6 +96,27 @@ def _outside() -> Floats:
     trees = 0.34 + 0.09 * cloud[:1] + 0.04 * np.sin(9.0 * u)
     green = np.array([0.09, 0.13, 0.055]) * (np.where(v < 0.16, 1.8, 0.75) * (1.0 + 0.4 * cloud))[..., None]
     return np.asarray(np.where((v < trees)[..., None], green, sky), np.float32)
+
+
+def _solid_box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], metres: float) -> Footprint:
+    outline = np.array([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])])
+    return Footprint(outline / metres, z[0] / metres, z[1] / metres)
+
+
+def _solid_walls(metres: float) -> tuple[Footprint, ...]:
+    """Return what lies behind the four walls, in units of `metres`."""
+    (x0, y0, _), (x1, y1, _) = LOW, HIGH
+    heights = (LOW[2], HIGH[2])
+    wide = (x0 - OUTSIDE, x1 + OUTSIDE)
+    deep = (y0 - OUTSIDE, y1 + OUTSIDE)
+    sides = (((wide[0], x0), deep), ((x1, wide[1]), deep), (wide, (deep[0], y0)), (wide, (y1, deep[1])))
+    return tuple(_solid_box(x, y, heights, metres) for x, y in sides)
+
+
+def _solid_furniture(metres: float) -> tuple[Footprint, ...]:
+    """Return what shelves and table top take up, in units of `metres`."""
+    shelves = _solid_box(*CASE, (LOW[2], BOARDS[-1]), metres)
+    return shelves, _solid_box(*TABLE, (-THICK, -0.001), metres)
 
 
 def _rows(strip: int, low: Doubles | float, high: Doubles | float) -> tuple[Doubles, Doubles]:
