@@ -29,6 +29,7 @@ from advsearch.attacks.verification import WORST_CASE
 from advsearch.cli.main import list_commands
 from advsearch.cli.show import REGISTRIES
 from advsearch.controls import CONTROLS, texture
+from advsearch.controls.support.norms import DEFAULT_EPSILON
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
@@ -286,7 +287,7 @@ MADE_BY_HAND = [
     ("scenes.md", f"gets the linear value {formation.METERED_WHITE}"),
     ("scenes.md", f"averaged down to at most {TEXTURE_LIMIT} texels"),
     ("scenes.md", "Maps larger than {1} x {0} are".format(*library.LARGEST)),
-    ("controls/texture.md", f"Default {texture.DEFAULT_EPSILON}"),
+    ("controls/texture.md", f"Default {DEFAULT_EPSILON}"),
     ("controls/texture.md", "at least {} and at most {}".format(*texture.RESOLUTIONS)),
     ("policies/pgd.md", f"the first after {100 * pgd.FIRST_WINDOW:.0f} % of the steps"),
     ("policies/pgd.md", {0.75: "fewer than three quarters of the steps"}[pgd.IMPROVING]),

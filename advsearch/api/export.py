@@ -21,9 +21,9 @@ from torch import Tensor
 
 import advsearch
 from advsearch import seeds
-from advsearch.controls.patch import enlarged
 from advsearch.controls.projector import ProjectorControl
 from advsearch.controls.space import file_name
+from advsearch.controls.support.images import enlarged
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.loading import Scene, as_controls, load_scene
 from advsearch.engine.problem import Problem

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named
-from advsearch.controls.pose import euler
 from advsearch.controls.ranges import OneOf, Spec, is_number
+from advsearch.controls.support.rotations import euler
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import PATH_ENDINGS, read_text
 from advsearch.options import rounded

@@ -25,9 +25,10 @@ from torch.nn import functional
 
 from advsearch.controls.base import LARGEST_EPSILON, Choice, Value, Values, measure, number
 from advsearch.controls.corruption_filters import picture, planes
-from advsearch.controls.patch import PRINT_SIDE, PictureControl, enlarged
 from advsearch.controls.ranges import Fixed, Range
-from advsearch.controls.texture import NORMS, radius
+from advsearch.controls.support.images import PRINT_SIDE, enlarged
+from advsearch.controls.support.norms import NORMS, radius
+from advsearch.controls.support.picture_control import PictureControl
 from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
