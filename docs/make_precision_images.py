@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from advsearch.controls import OWN
+from advsearch.controls import CONTROLS
 
 DOCS = Path(__file__).resolve().parent
 FOLDER, PAGE = DOCS / "images" / "precision", DOCS / "precision-diagrams.md"
@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     FOLDER.mkdir(parents=True, exist_ok=True)
     facts: dict[str, Any] = json.loads(FACTS.read_text("utf-8")) if FACTS.exists() else {}
-    for name in args.names or [PICTURE, *OWN]:
+    for name in args.names or [PICTURE, *CONTROLS.own]:
         facts[name] = measured(name, args.seconds, args.resolution)
         print(f"measured: {name}", file=sys.stderr, flush=True)
         FACTS.write_text(json.dumps(facts, indent=1, sort_keys=True) + "\n", encoding="utf-8")
@@ -74,7 +74,7 @@ def measured(name: str, seconds: int, resolution: int) -> dict[str, Any]:
 
 def page(facts: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the page."""
-    shown = sorted(name for name in facts if name in OWN)
+    shown = sorted(name for name in facts if name in CONTROLS.own)
     some = next(facts[name] for name in shown if "machine" in facts[name])
     machine, side = some["machine"], some["resolution"]
     usual = statistics.mode(facts[name]["seconds"] for name in shown if "seconds" in facts[name])
