@@ -15,8 +15,9 @@ class BuiltIn(NamedTuple):
     """A built-in part.
 
     Attributes:
-        kind: "experiment", "control", "policy", "task", "model source", "exporter" or "reader".
-        name: the word for it on the command line; of a reader the suffix of its files.
+        kind: "experiment", "control", "policy", "task", "model source", "exporter", "reader" of mesh files, or
+            "converter" of files to glTF.
+        name: the word for it on the command line; of a reader or converter the suffix of its files.
         target: "module:attribute" that is imported when the part is used.
         help: what it does, in a line that begins in lower case and has no full stop.
     """
@@ -312,17 +313,17 @@ BUILT_INS = (
         "exporter", "3db", f"{_EXPORTERS}.threedb:ThreeDB",
         "a sweep as a folder for 3DB's dashboard",
     ),
-    BuiltIn("reader", ".obj", f"{_READERS}.wavefront:read_obj", "Wavefront OBJ"),
-    BuiltIn("reader", ".ply", f"{_READERS}.ply:read_ply", "PLY"),
-    BuiltIn("reader", ".stl", f"{_READERS}.stl:read_stl", "STL"),
-    BuiltIn("reader", ".gltf", f"{_READERS}.gltf_parts:read_gltf", "glTF 2.0"),
-    BuiltIn("reader", ".glb", f"{_READERS}.gltf_parts:read_gltf", "binary glTF 2.0"),
-    BuiltIn("reader", ".vrm", f"{_READERS}.gltf_parts:read_gltf", "VRM, a person as glTF"),
-    BuiltIn("reader", ".blend", f"{_READERS}.blender:convert_blend", "Blender, through its own glTF exporter"),
-    BuiltIn("reader", ".usd", f"{_READERS}.usd:convert_usd", "OpenUSD, through glTF"),
-    BuiltIn("reader", ".usda", f"{_READERS}.usd:convert_usd", "OpenUSD as text, through glTF"),
-    BuiltIn("reader", ".usdc", f"{_READERS}.usd:convert_usd", "binary OpenUSD, through glTF"),
-    BuiltIn("reader", ".usdz", f"{_READERS}.usd:convert_usd", "a package of OpenUSD, through glTF"),
+    BuiltIn("reader", "obj", f"{_READERS}.wavefront:read_obj", "Wavefront OBJ"),
+    BuiltIn("reader", "ply", f"{_READERS}.ply:read_ply", "PLY"),
+    BuiltIn("reader", "stl", f"{_READERS}.stl:read_stl", "STL"),
+    BuiltIn("reader", "gltf", f"{_READERS}.gltf_parts:read_gltf", "glTF 2.0"),
+    BuiltIn("reader", "glb", f"{_READERS}.gltf_parts:read_gltf", "binary glTF 2.0"),
+    BuiltIn("reader", "vrm", f"{_READERS}.gltf_parts:read_gltf", "VRM, a person as glTF"),
+    BuiltIn("converter", "blend", f"{_READERS}.blender:convert_blend", "Blender, through its own glTF exporter"),
+    BuiltIn("converter", "usd", f"{_READERS}.usd:convert_usd", "OpenUSD, through glTF"),
+    BuiltIn("converter", "usda", f"{_READERS}.usd:convert_usd", "OpenUSD as text, through glTF"),
+    BuiltIn("converter", "usdc", f"{_READERS}.usd:convert_usd", "binary OpenUSD, through glTF"),
+    BuiltIn("converter", "usdz", f"{_READERS}.usd:convert_usd", "a package of OpenUSD, through glTF"),
 )  # fmt: skip
 
 

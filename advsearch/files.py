@@ -16,13 +16,14 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from advsearch.catalog import list_built_ins
 from advsearch.errors import FileFormatError, InputError
 
 FACTOR = "ADVSEARCH_LIMITS"  # environment variable with a number that all limits on the size of input are multiplied by
 JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None  # whatever JSON can hold
 JsonObject = dict[str, JsonValue]  # A JSON object, before a type has taken it or once it has been written out
-MESHES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".vrm", ".blend", ".usd", ".usda", ".usdc", ".usdz")
-"""Endings of the files that an object can be read from."""
+MESHES = tuple(f".{name}" for name in (*list_built_ins("reader"), *list_built_ins("converter")))
+"""Endings of the files that an object can be read from, but for those of other packages' readers."""
 DEPTH = 100  # deepest nesting of JSON, in lists and objects
 DEEPEST = 16  # lists and mappings inside one another that a setting may have
 DIGITS = 300  # most digits of a whole number; more than these have no floating-point form

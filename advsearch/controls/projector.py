@@ -61,6 +61,7 @@ class ProjectorControl(PictureControl):
     part: ProjectorPart
     _later = 0.0
     kind = "projector"
+    competes_with_ambient = True
     shown = "pattern"
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("pattern", (None, None, 3), "sRGB", 0.0, 1.0, "black, or grey",
@@ -190,12 +191,10 @@ class ProjectorControl(PictureControl):
 
     @property
     def ambient(self) -> float | None:
-        """Lux beside it; None where that is searched."""
         slot = next(one for one in self.slots if one.parameter.name == "ambient")
         return float(slot.spec.value) if isinstance(slot.spec, Fixed) else None
 
     def in_light(self, times: float) -> Self:
-        """Return the bound control in so many times the ambient light."""
         if self.ambient is None:
             return self
         there = copy.copy(self)

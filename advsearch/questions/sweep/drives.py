@@ -5,13 +5,14 @@ has ends that it cannot pass (`attacks.trials`)."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from advsearch.attacks.trials import mean_interval
 from advsearch.controls import Control
-from advsearch.controls.path import WAY, PathControl
+from advsearch.controls.base import WAY
 from advsearch.engine.naming import given_to
 from advsearch.options import OUT_OF_VIEW
 from advsearch.questions.attack.result import evenly, write_drive
@@ -34,10 +35,9 @@ Flags = npt.NDArray[np.int8]
 
 def with_frames(config: SweepConfig, drawn: tuple[Control, ...]) -> tuple[tuple[Control, ...], dict[str, object]]:
     """Return the controls with what travels along the path of the configuration, and the grid with its frames last."""
-    travelling = next((one for one in drawn if isinstance(one, PathControl)), None)
+    travelling: Any = next((one for one in drawn if one.travels), None)
     if travelling is None:
-        (added,) = given_to(config, {PathControl.kind: {}})
-        assert isinstance(added, PathControl)
+        (added,) = given_to(config, {"path": {}})
         drawn, travelling = (*drawn, added), added
     name, seconds = f"{travelling.name}.time", travelling.seconds
     frames = f"0:{seconds:g}:{max(2, round(seconds * config.fps) + 1)}"

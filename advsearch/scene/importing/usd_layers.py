@@ -19,8 +19,8 @@ from pxr import Ar, Sdf
 
 from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.blender import LAYERS, PACKAGE
 from advsearch.scene.importing.files import LARGEST_FILE, check_most, shown
+from advsearch.scene.importing.usd import LAYERS, PACKAGE
 
 MOST_LAYERS = 1000
 MOST_ENTRIES = 10_000
