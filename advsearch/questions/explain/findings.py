@@ -36,7 +36,7 @@ from scipy.stats import f as fisher
 from advsearch import rules
 from advsearch.attacks.trials import CONFIDENCE
 from advsearch.questions.explain.result import EnvelopeRow, ParameterWeight, RightOf, RuleNotTold
-from advsearch.rules import CountedRule, RuleCondition, RuleConditions, covered, interval_of
+from advsearch.rules import CountedRule, RuleCondition, RuleConditions, covered, interval_of, merge_repeats, share_of
 
 MOST_PARTS = 20
 ROWS_IN_A_CELL = 25  # Rows that a cell of two factors' parts has on average, at least
@@ -52,6 +52,7 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
     decide together more than each of the two by itself. Nothing where the predictions are all the same."""
     if table["correct"].nunique() < 2:
         return []
+    table = merge_repeats(table)
     predictions, factors = _Predictions(table), list(table.attrs["units"])
     fine, few = round(predictions.count ** (1.0 / 3.0)), max(2, math.isqrt(predictions.count // ROWS_IN_A_CELL))
     alone = [predictions.weight([factor], _parts(table[factor], fine)) for factor in factors]
@@ -164,6 +165,8 @@ RESERVE = 0.01  # By how much more the choosing rows have to show, since they we
 def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: float) -> EnvelopeRow | None:
     """Return the largest box that promises an accuracy in (0, 1), the lower end of a 95 % interval; None where no box
     of enough rows does. Some rows choose the box, and others try it, once."""
+    if choosing.empty:
+        return None
     conditions: RuleConditions = ()
     inside, independent = choosing, choosing["unit"].is_unique
     while interval_of(inside)[0] < min(accuracy + RESERVE, (1.0 + accuracy) / 2.0):
@@ -206,13 +209,20 @@ def _peeled(conditions: RuleConditions, inside: pd.DataFrame) -> Iterator[RuleCo
 
 
 def right_of(rows: pd.DataFrame) -> RightOf:
-    return RightOf(right=int(rows["correct"].sum()), total=len(rows), interval=interval_of(rows))
+    """Count right rows; their share is the mean over units."""
+    share = None if rows.empty else share_of(rows)
+    return RightOf(right=int(rows["correct"].sum()), total=len(rows), interval=interval_of(rows), share=share)
 
 
 def cautions(table: pd.DataFrame, importance: Sequence[ParameterWeight]) -> list[str]:
     """Return what a reader has to know of the rows of a table and of what decides."""
     texts, draws = list[str](), table["unit"].nunique()
-    if draws < rules.FEWEST_ROWS:
+    if draws == 1:
+        texts.append(
+            "The rows are of one draw: a single drive, or pictures that differ in noise alone. The shares are of this "
+            "one, and nothing is shown of others."
+        )
+    elif draws < rules.FEWEST_ROWS:
         texts.append(f"The rows are of {draws} draws, each with several, which are not independent: few show little.")
     if table["correct"].nunique() < 2:
         always = "right" if table["correct"].all() else "wrong"

@@ -12,8 +12,7 @@ from typing import Any
 
 from advsearch import seeds
 from advsearch.api.keywords import asks, configured
-from advsearch.attacks import clopper_pearson
-from advsearch.attacks.trials import mcnemar
+from advsearch.attacks.trials import mcnemar, share_interval
 from advsearch.engine.journal import check_made_of
 from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
 from advsearch.engine.record import Stages
@@ -234,8 +233,9 @@ class Hardening:
         ]
         return asked.result(
             HardenResult, **paired, environment=",".join(taught.environments), objects=list(taught.objects),
-            before=_share(before), after=_share(after), clean_before=_share(self.clean.get("before")),
-            clean_after=_share(self.clean.get("after")), table=table, split=split, rounds=rounds,
+            before=_share(before), after=_share(after),
+            clean_before=_share(self.clean.get("before"), scenes.CLEAN_VIEWS),
+            clean_after=_share(self.clean.get("after"), scenes.CLEAN_VIEWS), table=table, split=split, rounds=rounds,
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search=f"portfolio of pgd with restarts, cmaes and random, {scenes.TIMES * config.steps} steps",
             # a name with a colon is of code that makes it
@@ -247,8 +247,11 @@ class Hardening:
         )  # fmt: skip
 
 
-def _share(right: Sequence[bool] | None) -> Share | None:
+def _share(right: Sequence[bool] | None, views: int = 1) -> Share | None:
+    """Return the share of pictures that are right, so many `views` of each scene, one after the other, with its
+    interval over scenes: views of one scene are not independent."""
     if right is None:
         return None
-    total, count = sum(right), len(right)
-    return Share(accuracy=total / count, interval=clopper_pearson(total, count), right=total, count=count)
+    right_views = [sum(right[first : first + views]) for first in range(0, len(right), views)]
+    interval = share_interval(right_views, [views] * len(right_views))
+    return Share(accuracy=sum(right) / len(right), interval=interval, right=sum(right), count=len(right))

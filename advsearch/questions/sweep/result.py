@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from advsearch.attacks import clopper_pearson
-from advsearch.attacks.trials import paired_by_unit, per_unit, share_interval
+from advsearch.attacks.trials import mean_share, paired_by_unit, per_unit, share_interval
 from advsearch.errors import FileFormatError
 from advsearch.options import OUT_OF_VIEW
 from advsearch.pictures import LARGEST_FILE, check_pixels, opened
@@ -39,10 +39,19 @@ MOST_PREDICTIONS = 20  # wrong predictions that the summary lists, the most freq
 
 
 def counted_by_unit(right: npt.ArrayLike, units: npt.NDArray[np.int64]) -> CountedPredictions:
-    """Return count, accuracy and its 95 % interval of predictions (n,) that are of some units (n,)."""
+    """Return count, accuracy and its 95 % interval of predictions (n,) that are of some units (n,): the mean over units
+    of the share of each. One unit with several predictions has no interval."""
     right = np.asarray(right)
-    of = per_unit(np.ones(len(right)), units)
-    return rate(int(right.sum()), len(right), share_interval(per_unit(right, units), of) if len(right) else None)
+    if not len(right):
+        return rate(0, 0)
+    counted, of = per_unit(right, units), per_unit(np.ones(len(right)), units)
+    has_interval = len(of) > 1 or len(right) == 1
+    return CountedPredictions(
+        configurations=len(right),
+        correct=int(right.sum()),
+        accuracy=mean_share(counted, of),
+        interval=share_interval(counted, of) if has_interval else None,
+    )
 
 
 def rate(correct: int, seen: int, interval: tuple[float, float] | None = None) -> CountedPredictions:
