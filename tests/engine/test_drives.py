@@ -315,9 +315,10 @@ def test_pictures_of_a_longer_sweep_of_the_same_seed_are_not_counted_twice(tmp_p
 
 def test_samples_without_draws_and_grids_that_overlap_are_units_by_their_values(tmp_path: Path) -> None:
     grids = ({"pose.yaw": [0, 90, 180]}, {"pose.yaw": [90, 180, 270, 45]})
-    parts = swept_parts(tmp_path, *({"grid": grid, "samples": 4, "seed": seed} for seed, grid in enumerate(grids)))
+    moving: dict[str, Any] = {**DRIVE, "fps": 0.5, "samples": 4}
+    parts = swept_parts(tmp_path, *({**moving, "grid": grid, "seed": seed} for seed, grid in enumerate(grids)))
     rows = read_predictions(parts)
-    assert len(rows) == 28 and rows["unit"].nunique() == 5
+    assert len(rows) == 3 * 28 and rows["unit"].nunique() == 5
     assert rows.groupby("pose.yaw")["unit"].nunique().tolist() == [1] * 5
 
 

@@ -93,8 +93,9 @@ def _cells(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
 
 def _along(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
     at, accuracy = range(len(rows)), [row.accuracy for row in rows]
-    low, high = ([row.interval[end] for row in rows if row.interval] for end in (0, 1))
-    axes.vlines(at, low, high, color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
+    intervals = [(place, *row.interval) for place, row in enumerate(rows) if row.interval]  # of one draw there is none
+    if intervals:
+        axes.vlines(*zip(*intervals, strict=True), color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
     axes.plot(at, accuracy, "o", color=BLUE, label="accuracy")
     axes.set_xticks(*_ticks([row.value for row in rows]), rotation=45 if _long([r.value for r in rows]) else 0)
     axes.set(xlabel=axis_title(rows[0].axis, rows[0].unit), ylabel="accuracy", ylim=(-0.03, 1.03))
