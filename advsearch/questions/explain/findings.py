@@ -76,20 +76,22 @@ def _parts(column: pd.Series, most: int) -> Places:
 
 
 class _Predictions:
-    """The predictions of a table: (n,) whether they are right, and the number of the unit of each."""
+    """The predictions of a table: (n,) whether they are right, the number of the unit of each, and its weight: all
+    units weigh the same, so that few with many rows do not decide; 1 on average."""
 
     def __init__(self, table: pd.DataFrame) -> None:
         self.right: npt.NDArray[np.bool_] = table["correct"].to_numpy()
         units, self.units = np.unique(table["unit"], return_inverse=True)
         self.count, self.independent = len(units), table["unit"].is_unique
-        self.variance = float(self.right.mean()) * (1.0 - float(self.right.mean()))
+        self.weights = len(self.right) / self.count / np.bincount(self.units)[self.units]
+        self.mean = float(np.average(self.right, weights=self.weights))
+        self.variance = self.mean * (1.0 - self.mean)
 
     def between(self, parts: Places) -> tuple[float, int]:
         """The share of the variance between parts as it is counted, and the number of parts that have rows."""
-        seen = np.bincount(parts)
-        rate = np.bincount(parts, self.right)[seen > 0] / seen[seen > 0]
-        mean = float(self.right.mean())
-        return float((seen[seen > 0] * (rate - mean) ** 2).sum()) / len(self.right) / self.variance, len(rate)
+        seen = np.bincount(parts, self.weights)
+        rate = np.bincount(parts, self.weights * self.right)[seen > 0] / seen[seen > 0]
+        return float((seen[seen > 0] * (rate - self.mean) ** 2).sum()) / len(self.right) / self.variance, len(rate)
 
     def weight(self, factors: list[str], parts: Places) -> ParameterWeight:
         (counted, k), n, by_chance = self.between(parts), len(self.right), self.by_chance(parts)
@@ -108,12 +110,12 @@ class _Predictions:
     def by_chance(self, parts: Places) -> float:
         """What chance adds to the statistic of some parts, from how much units deviate: k - 1 where predictions are
         independent; NaN where too few units say it."""
-        seen, right = np.bincount(parts), self.right
+        seen, right = np.bincount(parts, self.weights), self.right
         if self.independent:
             return float((seen > 0).sum() - 1)
-        rate = np.bincount(parts, right) / np.maximum(seen, 1)
+        rate = np.divide(np.bincount(parts, self.weights * right), seen, out=np.zeros(len(seen)), where=seen > 0)
         both, places = np.unique(parts * self.count + self.units, return_inverse=True)
-        away = np.bincount(places.reshape(-1), right - rate[parts])
+        away = np.bincount(places.reshape(-1), self.weights * (right - rate[parts]))
         of, unit = both // self.count, both % self.count
         in_part = np.bincount(of, minlength=len(seen))
         if self.count < 2 or self.count <= (seen > 0).sum() or (in_part[seen > 0] < 2).any():
