@@ -96,16 +96,23 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
     n_configurations = int(configuration.max()) + 1
     if n_configurations == len(table):
         return table
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    units, unit = np.unique(table["unit"], return_inverse=True)
-    n_nodes = n_configurations + len(units)
-    edges = np.ones(len(table)), (configuration, n_configurations + unit)
-    component = connected_components(coo_array(edges, shape=(n_nodes, n_nodes)), directed=False)[1]
-    merged = table.assign(unit=component[configuration])
+    merged = table.assign(unit=connected(np.unique(table["unit"], return_inverse=True)[1], configuration))
     merged.attrs = table.attrs
     return merged
+
+
+def connected(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return the group (n,) of each row: rows with the same number (n,) from 0 of either kind are in one group."""
+    group = first
+    while True:
+        linked = group
+        for number in (second, first):
+            lowest = np.full(int(number.max()) + 1, len(group))
+            np.minimum.at(lowest, number, linked)
+            linked = lowest[number]
+        if (linked == group).all():
+            return group
+        group = linked
 
 
 def halves(table: pd.DataFrame, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
