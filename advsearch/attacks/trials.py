@@ -199,14 +199,13 @@ def draws_needed(mean: float, *, confidence: float, value: float = 1.0) -> int:
 
 def capital(mean: float, counts: Mapping[float, int]) -> float:
     """Return the logarithm of what the bets on "more than `mean`" have made of 1, -inf where all is lost."""
-    values = np.array(list(counts), dtype=np.float64)
-    return capital_of_units(mean, values, np.ones_like(values), np.array(list(counts.values())))
+    return log_capital(mean, np.array(list(counts), dtype=np.float64), np.array(list(counts.values())))
 
 
-def capital_of_units(mean: float, counted: npt.NDArray[Any], of: npt.NDArray[Any], times: npt.NDArray[Any]) -> float:
-    """Return the same of units (n,), so many `times` each, that count for `of` draws of the largest; see `units`."""
+def log_capital(mean: float, values: npt.NDArray[Any], times: npt.NDArray[Any]) -> float:
+    """Return the same of draws (n,) in [0, 1], so many `times` each."""
     with np.errstate(divide="ignore"):
-        won = np.log(np.maximum(1.0 - STAKES * of[:, None] + STAKES * (counted / mean)[:, None], 0.0))
+        won = np.log(np.maximum(1.0 - STAKES + STAKES * (values / mean)[:, None], 0.0))
         total = (times[:, None] * won).sum(axis=0)
     return float(np.logaddexp.reduce(total) - np.log(len(STAKES)))
 
@@ -444,10 +443,13 @@ def moved(here: Floats, below: Floats) -> float:
 # Shares of predictions that are not independent: frames of a drive, and what several models say of a picture, share
 # one draw. What was drawn, the *unit*, is independent of others, so that intervals and tests are over units.
 #
-# Of units with o_u predictions each, of which k_u count, the share is sum k_u / sum o_u. With m for the true one and O
-# for the largest o_u, who stakes a share c of what he has, at each unit, on "more than m" wins nothing on average:
+# All units weigh the same, however many predictions each has: the share is the mean over units of the share of each,
+# mean_u k_u / o_u of units with o_u predictions of which k_u count. (Pooled, sum k_u / sum o_u, a drive would weigh as
+# much as it has frames in view. That share has no interval without a bound on o_u, and the largest o_u that was seen is
+# none.) So each unit is one draw in [0, 1], and with m for the true mean, who stakes a share c of what he has, at each
+# unit, on "more than m" wins nothing on average:
 #
-#     K(m, c) = prod_u (1 - c o_u / O + c k_u / (O m))
+#     K(m, c) = prod_u (1 - c + c k_u / (o_u m))
 #
 # So K exceeds 2 / a with a probability of a / 2 at most (Markov), whatever units are like and however few there are,
 # also where each has a share of its own (the product's mean is at most 1, by the inequality of the means). These are
@@ -464,43 +466,58 @@ def per_unit(values: npt.ArrayLike, units: Units) -> Numbers:
     return np.bincount(places.reshape(-1), np.asarray(values, dtype=np.float64)).astype(np.float64)
 
 
+def mean_share(counted: npt.ArrayLike, of: npt.ArrayLike) -> float:
+    """Return the mean over units of the share of each: `counted` (n,) of the predictions `of` (n,) of a unit; units
+    without predictions are left out. NaN without any."""
+    k, o = np.asarray(counted, dtype=np.float64), np.asarray(of, dtype=np.float64)
+    k, o = k[o > 0.0], o[o > 0.0]
+    if not len(o):
+        return math.nan
+    if o.min() == o.max():
+        return float(k.sum() / o.sum())
+    return float((k / o).mean())
+
+
 def share_interval(counted: npt.ArrayLike, of: npt.ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the interval of a share of predictions, whatever the number of independent units. Each has predictions,
-    (n,) from 0, and one of them some; `counted` are (n,) from 0 to `of`; the confidence is between 0 and 1."""
+    """Return the interval of the mean over units of the share of each (`mean_share`), whatever the number of units.
+    Each has predictions, (n,) from 0, and one of them some; `counted` are (n,) from 0 to `of`; the confidence is
+    between 0 and 1."""
     k, o = np.asarray(counted, dtype=np.float64), np.asarray(of, dtype=np.float64)
     if k.shape != o.shape or not o.size or o.max() <= 0 or (k < 0).any() or (k > o).any():
         raise InputError("share: expected counts from 0 to the predictions of each unit, and one prediction at least")
     if o.max() == 1.0:
         return clopper_pearson(round(k.sum()), round(o.sum()), confidence)
-    return _by_bets(k, o, confidence)
+    return _by_bets(k[o > 0.0] / o[o > 0.0], confidence)
 
 
-def _by_bets(counted: Numbers, of: Numbers, confidence: float) -> tuple[float, float]:
-    rows, times = np.unique(np.stack([counted, of - counted, of], axis=1) / of.max(), axis=0, return_counts=True)
+def _by_bets(shares: Numbers, confidence: float) -> tuple[float, float]:
+    """Return the interval of the mean of independent draws (n,) in [0, 1]."""
+    values, times = np.unique(shares, return_counts=True)
     least = np.log(2.0 / (1.0 - confidence))
-    low = edge_of(lambda mean: capital_of_units(mean, rows[:, 0], rows[:, 2], times) < least)
-    return low, edge_of(lambda mean: capital_of_units(1.0 - mean, rows[:, 1], rows[:, 2], times) >= least)
+    low = edge_of(lambda mean: log_capital(mean, values, times) < least)
+    return low, edge_of(lambda mean: log_capital(1.0 - mean, 1.0 - values, times) >= least)
 
 
 def mean_interval(values: npt.ArrayLike, low: float, high: float) -> tuple[float, float]:
-    """Return the 95 % interval of the mean of independent numbers (n,) in a range that is known beforehand."""
+    """Return the 95 % interval of the mean of independent numbers (n,) in a range that is known beforehand: from the
+    plan, never from the numbers."""
     numbers = np.asarray(values, dtype=np.float64)
     if high <= low:
         return low, low
-    shares = np.clip((numbers - low) / (high - low), 0.0, 1.0)
-    first, last = _by_bets(shares, np.ones(len(shares)), CONFIDENCE)
+    first, last = _by_bets(np.clip((numbers - low) / (high - low), 0.0, 1.0), CONFIDENCE)
     return low + (high - low) * first, low + (high - low) * last
 
 
 def most_shown(units: int) -> float:
     """Return the lower end of a share's 95 % interval where so many units are right throughout: the most to show."""
-    return _by_bets(np.ones(units), np.ones(units), CONFIDENCE)[0]
+    return _by_bets(np.ones(units), CONFIDENCE)[0]
 
 
 def paired_by_unit(first: Any, second: Any, units: Units) -> tuple[float, tuple[float, float], float]:
     """Return how much more often the second of two outcomes (n,) happens than the first, the 95 % interval of that, and
     how likely it is that chance parts them as far where neither happens more often, in (0, 1]; rows (n,) of one unit
-    are not independent. The interval is without 0 where that is at most 0.05."""
+    are not independent, and all units weigh the same (`mean_share`). The interval is without 0 where that is at most
+    0.05."""
     first, second = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
     if len(np.unique(units)) == len(units):
         both, lost, won = (first & second).sum(), (first & ~second).sum(), (~first & second).sum()
@@ -508,10 +525,11 @@ def paired_by_unit(first: Any, second: Any, units: Units) -> tuple[float, tuple[
         return *paired_difference(*counts), mcnemar(counts[1], counts[2])
     of = per_unit(np.ones(len(first)), units)
     ahead = per_unit((1.0 + second - 1.0 * first) / 2.0, units)
-    low, high = _by_bets(ahead, of, CONFIDENCE)
-    scaled = np.stack([ahead, of - ahead, of]) / of.max()
-    won = max(capital_of_units(0.5, scaled[side], scaled[2], np.ones(len(of))) for side in (0, 1))
-    return float(second.mean() - first.mean()), (2 * low - 1, 2 * high - 1), float(min(1.0, 2.0 * np.exp(-won)))
+    low, high = _by_bets(ahead / of, CONFIDENCE)
+    once = np.ones(len(of))
+    most_won = max(log_capital(0.5, ahead / of, once), log_capital(0.5, 1.0 - ahead / of, once))
+    difference = mean_share(per_unit(second, units), of) - mean_share(per_unit(first, units), of)
+    return difference, (2 * low - 1, 2 * high - 1), float(min(1.0, 2.0 * np.exp(-most_won)))
 
 
 SHARES = np.linspace(0.0, 1.0, 402)[1:-1]  # of right predictions on both sides, at which two shares are compared
@@ -525,9 +543,9 @@ def fewer_by_chance(
     are right on the other.
 
     Where each unit has one prediction that is Fisher's exact test, one-sided. Where all units have as many and lie on
-    one side each, units are dealt out to the sides anew. Where the rule cuts through units, it is one over the least
-    that bets on "fewer here than m, more there" have made of 1, of all m: a bound, also where sides of a unit are
-    alike.
+    one side each, units are dealt out to the sides anew. Elsewhere, where the rule cuts through units or some have more
+    predictions than others, it is one over the least that bets on "fewer here than m, more there" have made of 1, of
+    all m: a bound, also where sides of a unit are alike. All units of a side weigh the same (`mean_share`).
 
     Args:
         inside, of: (n,) of each unit, right predictions and predictions under the rule.
@@ -543,17 +561,19 @@ def fewer_by_chance(
         here, there, right, others = (round(times * float(counts.sum())) for counts in (k, a, r, b))
 
         return float(hypergeom.cdf(here, there + others, here + right, there))
-    if (np.minimum(a, b) == 0.0).all() and len(np.unique(a + b)) == 1:
+    is_cut = bool(((a > 0.0) & (b > 0.0)).any())
+    if not is_cut and len(np.unique(a + b)) == 1:
         values, copies = np.unique(k + r, return_counts=True)
         copies, dealt = np.round(times * copies).astype(np.int64), round(times * float((a > 0).sum()))
         rng = np.random.default_rng(0)
         drawn = rng.multivariate_hypergeometric(copies, min(dealt, int(copies.sum())), EXCHANGES, method="marginals")
         return float((1 + (drawn @ values <= times * k.sum() + 1e-9).sum()) / (1 + EXCHANGES))
-    rows, copies = np.unique(np.stack([a - k, a, r, b], axis=1), axis=0, return_counts=True)
-    wrong, under, right, others = rows.T
-    half = np.where((under > 0) & (others > 0), 0.5, 1.0)[:, None]
-    bets = half * (wrong[:, None] / (1.0 - SHARES) - under[:, None]) / a.max()
-    bets += half * (right[:, None] / SHARES - others[:, None]) / b.max()
+    # What a unit wins or loses on each side; half is staked on each where a unit can have both.
+    wrong_here = np.divide(a - k, a, out=np.zeros_like(a), where=a > 0.0)
+    right_there = np.divide(r, b, out=np.zeros_like(b), where=b > 0.0)
+    rows, copies = np.unique(np.stack([wrong_here, a > 0.0, right_there, b > 0.0], axis=1), axis=0, return_counts=True)
+    wrong, is_here, right, is_there = (column[:, None] for column in rows.T)
+    bets = (0.5 if is_cut else 1.0) * (wrong / (1.0 - SHARES) - is_here + right / SHARES - is_there)
     with np.errstate(divide="ignore"):
         won = [times * (copies[:, None] * np.log(np.maximum(1.0 + stake * bets, 0.0))).sum(axis=0) for stake in STAKES]
     least = (np.logaddexp.reduce(won, axis=0) - np.log(len(STAKES))).min()

@@ -95,8 +95,9 @@ def _cells(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
 
 def _along(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
     at, accuracy = range(len(rows)), [row.accuracy for row in rows]
-    low, high = ([row.interval[end] for row in rows if row.interval] for end in (0, 1))
-    axes.vlines(at, low, high, color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
+    intervals = [(place, *row.interval) for place, row in enumerate(rows) if row.interval]  # of one draw there is none
+    if intervals:
+        axes.vlines(*zip(*intervals, strict=True), color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
     axes.plot(at, accuracy, "o", color=BLUE, label="accuracy")
     axes.set_xticks(*_ticks([row.value for row in rows]), rotation=45 if _long([r.value for r in rows]) else 0)
     axes.set(xlabel=axis_title(rows[0].axis, rows[0].unit), ylabel="accuracy", ylim=(-0.03, 1.03))
@@ -284,7 +285,7 @@ def _table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
 
 def claims(result: SweepSummary) -> Iterator[Claim]:
     """Yield the share of right predictions, and how often the worst of the configurations is wrong."""
-    if result.accuracy is None or result.interval is None or result.ending != "finished":
+    if result.accuracy is None or result.ending != "finished":
         return
     thing = f"frames of {result.drives[0].drives} drives" if result.drives else "configurations"
     how, note = f"{thing} drawn by chance from the ranges that are named", ""
@@ -340,7 +341,7 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
 
 
 def _extent(what: str, counts: CountedPredictions) -> Extent:
-    return counted(what, counts.correct, counts.configurations, counts.interval)
+    return counted(what, counts.correct, counts.configurations, counts.interval, counts.accuracy)
 
 
 DRIVE_HEADS = ("", "mean", "95 % interval", "worst drive")  # what stands above the rows
@@ -353,7 +354,8 @@ def rate_text(summary: SweepSummary) -> str:
 
 
 def drive_title(one: DriveRates) -> str:
-    what = f"{count(one.drives, 'drive')} of {one.frames} frames in {one.seconds:g} s, {one.model}"
+    repeats = f", {one.repeats} times each with other noise" if one.repeats > 1 else ""
+    what = f"{count(one.drives, 'drive')} of {one.frames} frames in {one.seconds:g} s{repeats}, {one.model}"
     return what if one.answer is None else f"{what}, with {one.answer}"
 
 
@@ -477,7 +479,8 @@ def distance_of(summary: SweepSummary) -> SeenFrom | None:
     """Return how far away one model sees one object; None where the sweep does not tell."""
     rows = [row for row in summary.axes if row.axis == DISTANCE and row.configurations]
     several = "," in summary.object or "," in summary.model or summary.beside is not None
-    several = several or summary.drives is not None  # frames of a drive are not independent
+    # frames of a drive are not independent, nor are samples of a point where nothing is drawn
+    several = several or summary.drives is not None or summary.units is not None
     known = summary.task.partition("=")[0] == "detection" and len(rows) > 1 and not several
     return seen_from(rows) if known else None
 

@@ -33,7 +33,7 @@ from advsearch.questions.sweep.result import FINISHED, Predictions, SweepResult,
 from advsearch.questions.sweep.settings import BLIND
 from advsearch.questions.sweep.summary import WorstConfiguration, WorstVerified
 from advsearch.questions.sweep.surface import map_surface
-from advsearch.report.wording import count
+from advsearch.report.wording import count, repeats_remark
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
 from advsearch.runs.files import write_bytes, write_layers
 from advsearch.runs.results import INTERRUPTED, DescribedValue, Formation, LinearTransport, SharedWork
@@ -341,8 +341,12 @@ class Sweep:
         self, predictions: Predictions, checked: WorstVerified | None, changes: Sequence[results.ChangeRates]
     ) -> Iterator[str]:
         yield from (*lost_remarks(self._lost), *self.journal.remarks)
+        if self.units.noise > 1:
+            yield repeats_remark(self.units.name, self.units.noise, self.total // self.units.size)
         few = min((rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES)
-        if few < ENOUGH_DRIVES:
+        if few == 1 and self.units.noise == 1:
+            yield "One drive says nothing of others: there is no interval over drives."
+        elif 1 < few < ENOUGH_DRIVES:
             yield (
                 f"{count(few, 'drive')} can show little: were the model right in all their frames, the interval of "
                 f"that share would begin at {100 * most_shown(few):.0f} %."
