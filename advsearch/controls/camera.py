@@ -167,7 +167,8 @@ class CameraControl(Control):
         return self.scene
 
     def _orbit(self, values: Values, distance: Tensor) -> Tensor:
-        azimuth, elevation, roll = (torch.deg2rad(values[name]) for name in ("azimuth", "elevation", "roll"))
+        azimuth = torch.deg2rad(self.scene.azimuth_zero + values["azimuth"])
+        elevation, roll = torch.deg2rad(values["elevation"]), torch.deg2rad(values["roll"])
         keeps_height = "height" in self.specs  # above the ground, so that the elevation follows
         if not {"elevation", "height"} & self.specs.keys():
             searched = any(slot.width for slot in self.slots if slot.parameter.name == "height")

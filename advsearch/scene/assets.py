@@ -135,6 +135,7 @@ class ObjectAsset(Shape):
     finishes: Mapping[str, Material] = field(default_factory=dict)
     metres: float | None = None  # its largest extent, where distances of the camera are in metres (see below)
     extent: float | None = None  # its largest extent in the coordinates of its file
+    drives: bool = True  # in a lane it faces as the traffic drives; otherwise it faces those who come, as signs do
 
     @property
     def notes(self) -> tuple[str, ...]:

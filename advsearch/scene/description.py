@@ -19,7 +19,7 @@ import torch
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import reading
 from advsearch.scene import geometry, library, settings
-from advsearch.scene.assets import TRIPOD, Doubles, EnvironmentAsset, Material, ObjectAsset, doubts, on_roads, sized
+from advsearch.scene.assets import TRIPOD, Doubles, EnvironmentAsset, Material, ObjectAsset, doubts, sized
 from advsearch.scene.camera_entries import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
@@ -143,8 +143,8 @@ class SceneDescription:
         on_table = on_plane and self.object.metres <= ON_TABLES
         if "camera.elevation" not in self.given:
             own["camera.height"] = preset.height - (TABLE if on_table or FLOOR in self.around else 0.0)
-        if preset.azimuth is not None:
-            own["camera.azimuth"] = preset.azimuth + (180.0 if on_roads(self.object) else 0.0)
+        if preset.in_lane:
+            own["camera.azimuth"] = 0.0
         if on_table:
             own["ground.size"] = TABLE_SIDE / self.metres
         values = {**self.values, **{setting: value for setting, value in own.items() if setting not in self.given}}
@@ -154,6 +154,12 @@ class SceneDescription:
         fov = torch.tensor(seen.number("camera.fov"), dtype=torch.float64)
         fitted = float(geometry.framing_distance(seen, fov, seen.aspect)) * seen.metres
         return seen.with_values(camera__distance=max(preset.distance, fitted))
+
+    @property
+    def azimuth_zero(self) -> float:
+        """The direction from the object, in degrees from +x, in which the camera of azimuth 0 stands."""
+        in_lane = self.preset != "" and PRESETS[self.preset].in_lane
+        return 180.0 if in_lane and self.object.drives else 0.0
 
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
