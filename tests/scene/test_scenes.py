@@ -83,7 +83,7 @@ def test_a_node_is_the_object_and_the_rest_stays_in_its_place_around_it(file: Pa
     assert np.ptp(scene.base_vertices, axis=0) == pytest.approx([1.0, 1.0, 1.0])
     wall = scene.meshes["the-wall"]
     corners = wall.mesh.vertices @ wall.to_world[:3, :3].T + wall.to_world[:3, 3]
-    # in the file x -5 to 5, height 0 to 6, depth z -5.1 to -4.9, which is our x; the crate of side 2 stands at (1, 0, 0)
+    # in the file x -5 to 5, height 0 to 6, z -5.1 to -4.9, which is our x; the crate of side 2 stands at (1, 0, 0)
     assert corners.min(axis=0) == pytest.approx([-2.55, -3.0, 0.0], abs=1e-5)
     assert corners.max(axis=0) == pytest.approx([-2.45, 2.0, 3.0], abs=1e-5)
     assert scene.number("ground.size") == 0.0
