@@ -267,7 +267,7 @@ def test_vertex_colors_are_interpolated_in_linear_light(kind: str, width: int, t
     assert asset.warnings == ("made.glb: its vertex or face colours were baked into a texture (512 x 512 texels)",)
     share = np.random.default_rng(0).dirichlet([1.0] * 3, 50)
     for face in asset.mesh.faces:
-        x = share @ (asset.mesh.vertices[face, 0] + 0.5)
+        x = share @ (asset.mesh.vertices[face, 1] + 0.5)
         got = srgb_to_linear(sampled(asset.base_color, share @ asset.mesh.uvs[face].astype(np.float64)))
         assert got == pytest.approx(np.repeat(x[:, None], 3, axis=1), abs=0.01)
 
