@@ -109,8 +109,8 @@ WRONG: dict[str, tuple[Any, str]] = {
 }
 
 GIVEN: dict[str, Any] = {
-    "object": "mug.obj", "environment": "room.hdr", "up": "y", "facing": "-z", "size": 4.9, "unit": "cm", "camera": "front",
-    "things": "car@1,2", "judge": "car",
+    "object": "mug.obj", "environment": "room.hdr", "up": "y", "facing": "-z", "size": 4.9, "unit": "cm",
+    "camera": "front", "things": "car@1,2", "judge": "car",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
     "labels": "labels.json", "prompt": "a photo of a {}", "ask": {"calls": 5.0}, "task": "detection",
