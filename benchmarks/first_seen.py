@@ -43,7 +43,8 @@ JITTER: dict[str, Any] = {
         "shift_y": [-0.03, 0.03],
     }
 }
-"""What differs between draws; azimuth 0 is behind the car. Nothing but the camera moves, so that no scene is built anew."""
+"""What differs between draws; azimuth 0 is behind the car. Nothing but the camera moves, so that no scene is built
+anew."""
 
 
 class Light(NamedTuple):
