@@ -1,4 +1,4 @@
-"""How far away a detector first sees a car, from a dashcam that comes nearer: by day, in the wet, at dusk, by night.
+"""How far away a detector first sees a car, from a dashcam that follows it: by day, in the wet, at dusk, by night.
 
     python benchmarks/first_seen.py detector.pt2 [--labels coco90] [--label car] [--draws 8] [--distances 10,16,22]
 
@@ -48,7 +48,8 @@ JITTER: dict[str, Any] = {
         "shift_y": [-0.03, 0.03],
     }
 }
-"""What differs between draws. Nothing but the camera moves, so that no scene is built anew."""
+"""What differs between draws; azimuth 0 is behind the car. Nothing but the camera moves, so that no scene is built
+anew."""
 
 
 class Light(NamedTuple):

@@ -38,8 +38,8 @@ from advsearch.viewer import thumbnails
 DRAWS = ("grid", "controls", "samples", "sampler", "seed")  # The settings that decide what is drawn
 OF_THE_SIDE = ("object", "model", "answer")  # What may tell sides apart, as rows have it
 FOLLOWS = (
-    *(*DRAWS, "label", "labels", "prompt", "up", "size", "unit", "batch", "keep_pictures", "trials", "verify_spp"),
-    *("specialise", "value_range"),
+    *(*DRAWS, "label", "labels", "prompt", "up", "facing", "size", "unit", "batch", "keep_pictures", "trials"),
+    *("verify_spp", "specialise", "value_range"),
 )
 """Settings that do not tell sweeps apart: of draws, along with object and model, or of no adversarial scene."""
 TOLERANCE = 1e-4  # Of a value, relative to the largest in its column: values come from single precision

@@ -57,7 +57,7 @@ class HardenConfig(AttackConfig):
     without: ClassVar[tuple[str, ...]] = (
         "smallest", "ensemble", "printable", "aov", "metrics", "log", "target", "minimise", "over", "draws", "path",
         "shutter", "rolling",
-        "average", "baseline", "seconds", "camera", "up", "size", "unit", "label", "measure", "estimators",
+        "average", "baseline", "seconds", "camera", "up", "facing", "size", "unit", "label", "measure", "estimators",
         "things", "judge",
     )
 
