@@ -218,7 +218,7 @@ def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
         "size",
         "unit",
     )
-    names += ("resolution",)
+    names += ("unit", "resolution")
     asked = {name: value for name in names if (value := getattr(config, name)) is not None}
     settings: Settings = {**chosen.settings, **asked}
     if "object" not in settings:
