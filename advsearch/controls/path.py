@@ -366,7 +366,8 @@ class PathControl(Control):
         start = start_of(self.scene, time.device)
         shift, _ = self._object(ways, start, time)
         away = self._camera(ways, start, time, shift)[0] - start.middle - shift
-        return away.norm(dim=-1).double() * self.scene.metres
+        distance: Tensor = away.norm(dim=-1).double() * self.scene.metres
+        return distance
 
     def _ways(self, values: Values) -> Ways:
         return self._paths[int(values[WAY])] if WAY in values else self._paths[0]

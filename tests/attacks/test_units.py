@@ -160,7 +160,7 @@ def test_all_units_weigh_the_same() -> None:
     first, second = np.arange(13) < 1, np.arange(13) > 6
     difference, (low, high), p = paired_by_unit(first, second, units)
     assert difference == pytest.approx((0.0 - 1.0 + 0.5 - 0.0) / 2) and low < difference < high and p > 0.05
-    assert paired_by_unit(first, second, np.zeros(13))[2] == 1.0, "one unit shows nothing"
+    assert paired_by_unit(first, second, np.zeros(13, np.int64))[2] == 1.0, "one unit shows nothing"
 
 
 @pytest.mark.parametrize("count", [5, 12, 30])

@@ -265,7 +265,8 @@ def test_repeats_of_one_drive_that_differ_in_noise_are_one_drive(
     paths = [tmp_path / name for name in ("first", "second")]
     for path, frames in zip(paths, ("11100", "11000"), strict=True):
         (said,), result = clocked(frames, **REPEATED, run=path)
-    assert (said.drives, said.repeats, said.right.mean, said.right.interval) == (1, 6, pytest.approx(0.4), None)
+    assert (said.drives, said.repeats) == (1, 6)
+    assert said.right.mean == pytest.approx(0.4) and said.right.interval is None
     assert said.first_seen is not None and said.first_seen.interval is None and said.longest_gap.interval is None
     swept = result.summary
     assert (swept.units, swept.accuracy, swept.interval) == (1, pytest.approx(0.4), None)

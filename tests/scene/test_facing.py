@@ -24,6 +24,7 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import glb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import import_scene
+from advsearch.scene.parts import MeshPart
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 LONG, WIDE, HIGH = 4.2, 1.8, 1.4  # metres of the car of boxes
@@ -117,7 +118,8 @@ def dashcam(name: object, environment: str = "street", **given: Any) -> SceneDes
 
 
 def test_a_name_or_a_label_does_not_decide_which_side_a_dashcam_sees(tmp_path: Path) -> None:
-    for suffix, given in ((".glb", {}), (".obj", {"size": LONG, "up": "y"})):
+    settings: dict[str, dict[str, Any]] = {".glb": {}, ".obj": {"size": LONG, "up": "y"}}
+    for suffix, given in settings.items():
         scenes = [
             dashcam(write_car(tmp_path / f"{name}{suffix}", "+z" if suffix == ".glb" else "+x"), **given)
             for name in ("wcar", "my-car", "thing")
@@ -216,6 +218,7 @@ def test_a_scene_file_is_turned_as_a_whole(tmp_path: Path) -> None:
     file.header["scenes"] = [{"nodes": [0, 1]}]
     scene = import_scene(file.write(tmp_path), "one")
     (ahead,) = scene.surroundings
+    assert isinstance(ahead, MeshPart)
     shift = ahead.to_world[:3, 3]
     assert shift[0] == pytest.approx(5.0) and abs(shift[1]) < 1e-6
 

@@ -217,8 +217,8 @@ def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
         "facing",
         "size",
         "unit",
+        "resolution",
     )
-    names += ("unit", "resolution")
     asked = {name: value for name in names if (value := getattr(config, name)) is not None}
     settings: Settings = {**chosen.settings, **asked}
     if "object" not in settings:

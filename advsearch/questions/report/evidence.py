@@ -72,7 +72,8 @@ def conditions_of(result: Result, photographs: Sequence[Row] | None = None) -> l
     agree with the rendering that they were aligned with: right in both or wrong in both."""
     conditions = []
     for row in result.axes if isinstance(result, SweepSummary) else ():
-        right, total, interval = row.correct, row.configurations, row.interval or (0.0, 1.0)  # none of one draw
+        right, total = row.correct, row.configurations
+        interval: tuple[float, float] | None = row.interval or (0.0, 1.0)  # none of one draw
         if photographs is not None:
             agree = [
                 bool(photo.correct) == bool(cast(Any, photo.payload)["photo"]["right"])

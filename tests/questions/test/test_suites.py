@@ -391,7 +391,13 @@ def test_every_setting_that_decides_a_verdict_is_the_counterexample_s_own(settin
     judged = kept_case(**wanted).config_for(suite, {})
     same = getattr(judged, setting.field) == getattr(AttackConfig(**wanted), setting.field)
     assert same or setting.name in OF_SUITE
-    of_others = {"object": "bowl", "model": "other.pt2", "label": "car", "judge": "all", "task": "classification"}
+    of_others: dict[str, Any] = {
+        "object": "bowl",
+        "model": "other.pt2",
+        "label": "car",
+        "judge": "all",
+        "task": "classification",
+    }
     of_others |= {"environment": "noon", "resolution": 64, "camera": "robot", "exposure": 1.0, "set": {}}
     other = suite_of({"settings": of_others, "claims": {"a": GOOD}}, "suite.yaml")
     judged = kept_case(**wanted).config_for(other, {"model": None, "threads": 1, "deterministic": None})
