@@ -22,10 +22,10 @@ import numpy.typing as npt
 import pandas as pd
 
 from advsearch import seeds
-from advsearch.attacks.trials import fewer_by_chance, mean_share, per_unit, share_interval
 from advsearch.errors import InputError
 from advsearch.options import OUT_OF_VIEW
 from advsearch.runs.results import ConditionRow
+from advsearch.statistics.clustered import fewer_by_chance, mean_share, per_unit, share_interval
 
 Mask = npt.NDArray[np.bool_]
 FEWEST_ROWS = 100  # rows of which one half can choose and the other can count

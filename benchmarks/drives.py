@@ -28,9 +28,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from advsearch.attacks.trials import fewer_by_chance, mean_interval, paired_by_unit, share_interval
 from advsearch.questions.explain.findings import find_importance
 from advsearch.rules import find_rules, halves
+from advsearch.statistics.clustered import fewer_by_chance, mean_interval, paired_by_unit, share_interval
 
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]

@@ -33,8 +33,9 @@ from torch.nn.functional import max_pool2d
 
 import advsearch
 from advsearch.options import Outcome
-from advsearch.questions.sweep.display import distance_of, distance_sentence, find_dips
+from advsearch.questions.sweep.display import distance_of, distance_sentence
 from advsearch.questions.sweep.summary import AxisRow
+from advsearch.statistics.monotone import find_dips
 
 SECONDS_MOST, F_NUMBER, READ = 1.0 / 30.0, 2.0, 3.0
 """Of the camera: the longest exposure, the lens, and electrons of noise in the dark."""

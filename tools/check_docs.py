@@ -22,7 +22,7 @@ from types import ModuleType
 import reference_scenes
 import torch
 
-from advsearch.attacks import POLICIES, candidates, clopper_pearson, planned_renders, trials, verification
+from advsearch.attacks import POLICIES, candidates, planned_renders, trials, verification
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
@@ -48,6 +48,8 @@ from advsearch.scene.importing.pictures import TEXTURE_LIMIT
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import settings
+from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
+from advsearch.statistics.sequential import draws_needed
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -245,7 +247,7 @@ def _exceptions(samples: int) -> float:
 
 def _draws(mean: float, value: float = 1.0) -> int:
     """Pictures that decide a claim where all predictions are alike."""
-    return trials.draws_needed(mean, confidence=trials.CONFIDENCE, value=value)
+    return draws_needed(mean, confidence=CONFIDENCE, value=value)
 
 
 MADE_BY_HAND = [

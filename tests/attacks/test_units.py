@@ -9,20 +9,19 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import fisher_exact
 
-from advsearch.attacks.trials import (
-    ConfidenceSequence,
-    clopper_pearson,
+from advsearch.errors import InputError
+from advsearch.statistics.clustered import (
     fewer_by_chance,
-    mcnemar,
     mean_interval,
     mean_share,
     most_shown,
     paired_by_unit,
-    paired_difference,
     per_unit,
     share_interval,
 )
-from advsearch.errors import InputError
+from advsearch.statistics.intervals import clopper_pearson
+from advsearch.statistics.paired import mcnemar, paired_difference
+from advsearch.statistics.sequential import ConfidenceSequence
 
 FRAMES = 8
 

@@ -15,8 +15,6 @@ from test_sweep_workers import Disorder, rows, summary
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.attacks import clopper_pearson
-from advsearch.attacks.trials import share_interval
 from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.journal import worker_call
 from advsearch.errors import InputError
@@ -32,6 +30,8 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import DriveRates
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.tables import read_sweep
+from advsearch.statistics.clustered import share_interval
+from advsearch.statistics.intervals import clopper_pearson
 
 SMALL: dict[str, Any] = {"resolution": 16, "spp": 1, "trials": 0, "batch": 4}
 

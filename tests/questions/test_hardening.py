@@ -19,7 +19,7 @@ from small_models import Colours
 from torch import Tensor, nn
 
 from advsearch import threads
-from advsearch.attacks import Block, Domain, clopper_pearson
+from advsearch.attacks import Block, Domain
 from advsearch.bundled.changed_light import white_light_changed
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
@@ -52,6 +52,7 @@ from advsearch.questions.harden.scenes import (
 from advsearch.questions.harden.training import ClassifierCourse, Gradients
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.library import load_environment
+from advsearch.statistics.intervals import clopper_pearson
 
 LABELS = [f"class {number}" for number in range(14)]
 

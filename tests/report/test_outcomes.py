@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 from samples import EXPLAIN, HARDEN, SHARE, attack, rated, sweep
 
-from advsearch.attacks.trials import clopper_pearson
 from advsearch.options import OUT_OF_VIEW, Outcome
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.wording import attack_verdict, remarks
@@ -22,6 +21,7 @@ from advsearch.questions.test.result import FAILED, search_verdict, share_reason
 from advsearch.report.shown import shown
 from advsearch.runs.store import Row
 from advsearch.runs.tables import count_wrong_outcomes, sweep_frame
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement, Prediction
 
 COUNTS = {"missed": 2, "loose": 3}

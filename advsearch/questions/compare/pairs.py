@@ -19,7 +19,6 @@ import numpy.typing as npt
 import pandas as pd
 
 from advsearch import seeds
-from advsearch.attacks.trials import mean_share, paired_by_unit, per_unit
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.experiment import RunContext
 from advsearch.questions.compare.result import ComparedPair, CountOf, PairPart, PairPicture, PairRule
@@ -33,6 +32,7 @@ from advsearch.runs.directory import CONFIG
 from advsearch.runs.files import write_bytes
 from advsearch.runs.summary import read_result
 from advsearch.runs.tables import read_sweep
+from advsearch.statistics.clustered import mean_share, paired_by_unit, per_unit
 from advsearch.viewer import thumbnails
 
 DRAWS = ("grid", "controls", "samples", "sampler", "seed")  # The settings that decide what is drawn

@@ -34,10 +34,10 @@ from scipy.stats import chi2, ncf, ncx2
 from scipy.stats import f as fisher
 
 from advsearch import rules
-from advsearch.attacks.trials import CONFIDENCE
 from advsearch.questions.explain.result import EnvelopeRow, ParameterWeight, RightOf, RuleNotTold
 from advsearch.rules import CountedRule, RuleCondition, RuleConditions, covered, interval_of, merge_repeats, share_of
 from advsearch.runs.tables import count_wrong_outcomes
+from advsearch.statistics.intervals import CONFIDENCE
 
 MOST_PARTS = 20
 ROWS_IN_A_CELL = 25  # Rows that a cell of two factors' parts has on average, at least

@@ -13,7 +13,6 @@ from typing import Any
 
 from advsearch import seeds
 from advsearch.api.keywords import asks, configured
-from advsearch.attacks.trials import mcnemar, share_interval
 from advsearch.engine.journal import check_made_of
 from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
 from advsearch.engine.record import Stages
@@ -33,6 +32,8 @@ from advsearch.registry import get_experiment
 from advsearch.runs.directory import ARTIFACTS, RunDirectory, is_run, run_path
 from advsearch.runs.results import SharedWork
 from advsearch.runs.store import Row
+from advsearch.statistics.clustered import share_interval
+from advsearch.statistics.paired import mcnemar
 from advsearch.tasks import make_task
 
 MEANS = "means"  # the note of what a training has from Python

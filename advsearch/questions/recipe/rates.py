@@ -17,7 +17,6 @@ import pandas as pd
 from pandas.api.types import is_numeric_dtype
 from pydantic import BaseModel, ConfigDict, Field
 
-from advsearch.attacks.trials import CONFIDENCE, mean_share, per_unit, share_interval
 from advsearch.errors import InputError
 from advsearch.options import OUT_OF_VIEW
 from advsearch.questions.attack.summary import AttackSummary
@@ -30,6 +29,8 @@ from advsearch.runs.directory import IMAGES, PARTS
 from advsearch.runs.results import Interval
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.tables import units_of
+from advsearch.statistics.clustered import mean_share, per_unit, share_interval
+from advsearch.statistics.intervals import CONFIDENCE
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The rows of a recipe's runs as one frame, and what all figures make of it: counts, sentences, a picture.

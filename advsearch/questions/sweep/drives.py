@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from advsearch.attacks.trials import mean_interval, per_unit
 from advsearch.controls import Control
 from advsearch.controls.path import WAY, PathControl
 from advsearch.engine.naming import given_to
@@ -27,6 +26,7 @@ from advsearch.report.figures import marked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.runs.tables import Units
+from advsearch.statistics.clustered import mean_interval, per_unit
 from advsearch.tasks import Detection
 from advsearch.tasks.boxes import LEAST_OVERLAP
 

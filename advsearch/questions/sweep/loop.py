@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.attacks.domain import batches
-from advsearch.attacks.trials import most_shown
 from advsearch.cluster import Executor, InProcess
 from advsearch.engine.journal import Journal, Sent, Shared, finite, lost, other_numbers, same, worker_call
 from advsearch.engine.loading import framed
@@ -39,6 +38,7 @@ from advsearch.runs.files import write_bytes, write_layers
 from advsearch.runs.results import INTERRUPTED, DescribedValue, Formation, LinearTransport, SharedWork
 from advsearch.runs.store import Row
 from advsearch.runs.tables import EDGES, NOTE
+from advsearch.statistics.clustered import most_shown
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 

@@ -15,8 +15,6 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from advsearch.attacks import clopper_pearson
-from advsearch.attacks.trials import mean_share, paired_by_unit, per_unit, share_interval
 from advsearch.errors import FileFormatError
 from advsearch.options import OUT_OF_VIEW, Outcome, get_outcome
 from advsearch.pictures import LARGEST_FILE, check_pixels, opened
@@ -30,6 +28,8 @@ from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory, default_name
 from advsearch.runs.export import read_threedb
 from advsearch.runs.tables import Units, read_sweep, to_pandas
+from advsearch.statistics.clustered import mean_share, paired_by_unit, per_unit, share_interval
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 
