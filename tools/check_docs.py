@@ -32,6 +32,7 @@ from advsearch.controls import CONTROLS, texture
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
+from advsearch.registry import EXPERIMENTS
 from advsearch.questions.attack import stages
 from advsearch.questions.attack.settings import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
@@ -355,7 +356,7 @@ def words() -> Iterator[str]:
 MADE_UP = {"tests/test_architecture.py", "tests/test_docs.py", "tests/test_registry.py"}
 """Tests of such rules, which name modules that are not there."""
 NAME = re.compile(r"(?<![\w./-])`?(advsearch(?:\.[A-Za-z_]\w*)+)(?:\(\))?`?(?![\w/-])")
-GROUPS = {one.group for one in (CONTROLS, OBJECTIVE_KINDS, POLICIES, SOURCES_OF_MODELS)}
+GROUPS = {registry.group for registry in (CONTROLS, EXPERIMENTS, OBJECTIVE_KINDS, POLICIES, SOURCES_OF_MODELS)}
 """Groups of entry points, which are names and no modules."""
 PATH = re.compile(rf"(?<![\w./-])((?:{'|'.join(FOLDERS)})/[\w./-]*\w\.(?:py|md|sh|json|png))")
 PLACEHOLDER = re.compile(r"\b[A-Z]{4,}\.")
