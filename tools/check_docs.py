@@ -32,7 +32,6 @@ from advsearch.controls import CONTROLS, texture
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
-from advsearch.registry import EXPERIMENTS
 from advsearch.questions.attack import stages
 from advsearch.questions.attack.settings import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
@@ -41,6 +40,7 @@ from advsearch.questions.region import growing as mapping
 from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test import counterexamples as tested
+from advsearch.registry import EXPERIMENTS
 from advsearch.runs import directory, export, store
 from advsearch.runs.results import RenderResult, Result
 from advsearch.scene import formation, library
