@@ -66,7 +66,7 @@ def written(command: str, **given: Any) -> Path:
         one.name: NEEDED.get(one.name, "mug") for one in settings(CONFIGS[command]) if one.required and not one.default
     }
     needed |= {"object": "mug", "compared": "reference,a.pt2"} if command == "compare" else {}
-    Path("a.yaml").write_text(HEADER + yaml.safe_dump({"schema": 1, "command": command, **needed, **given}))
+    Path("a.yaml").write_text(HEADER + yaml.safe_dump({"schema": 2, "command": command, **needed, **given}))
     return Path("a.yaml")
 
 
@@ -188,7 +188,7 @@ def test_a_part_has_the_workers_of_who_asks(monkeypatch: pytest.MonkeyPatch) -> 
     text = (path / "run.yaml").read_text()
     (path / "run.yaml").write_text(text.replace("workers: null", "workers: 1").replace("log: null", "log: wandb"))
     seen: list[Any] = []
-    monkeypatch.setattr(studies, "carry_out", lambda config, **_: seen.append(config))
+    monkeypatch.setattr(studies, "run_experiment", lambda config, **_: seen.append(config))
     for workers in (3, None):
         asked = SweepConfig(object="mug", grid={"pose.yaw": [0.0]}, workers=workers)
         studies.carry_out_part(path, asked, NullProgress())
