@@ -333,7 +333,7 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
         done.append(config.object)
         return real(config, **named)
 
-    monkeypatch.setattr(studies, "carry_out", stopping)
+    monkeypatch.setattr(studies, "run_experiment", stopping)
     with pytest.raises(KeyboardInterrupt):
         advsearch.recipe(path, run=run)
     path.unlink()  # it goes on as it began
