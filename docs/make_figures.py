@@ -426,17 +426,18 @@ RECIPES = "images/recipes/results.json"
 
 
 def recipe_results(record: Record) -> str:
-    """What `docs/make_recipe_images.py` kept of each recipe, on bundled objects and on other data."""
+    """What `docs/make_recipe_images.py` kept of each recipe: on other data, or else on bundled objects."""
     path = DOCS / RECIPES
     kept = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return "\n".join(_recipe(name, kept.get(name, {})) for name in sorted({*kept, *recipe_names()}))
 
 
 def _recipe(name: str, found: Mapping[str, Any]) -> str:
-    text = f"### {name}\n"
-    for kind, how in (("bundled", "With `--quick`"), ("data", "On real data")):
-        text += "\n" + (_recipe_on(found[kind], how) if kind in found else f"**{how}**: not run yet.\n")
-    return text
+    text = f"### {name}\n\n"
+    for kind, how in (("data", "On real data"), ("bundled", "With `--quick`")):
+        if kind in found:
+            return text + _recipe_on(found[kind], how)
+    return text + "Not run yet.\n"
 
 
 def _recipe_on(told: Mapping[str, Any], how: str) -> str:
@@ -448,7 +449,7 @@ def _recipe_on(told: Mapping[str, Any], how: str) -> str:
     text = _wrapped(f"**{how}**: {what} in {places}, seen by {models}; {told['renders']} renders{took}.") + "\n"
     for figure in told["figures"]:
         text += f"![{figure['title']}](images/recipes/{figure['image']})\n\n"
-        text += _wrapped(f"*{figure['title']}.* " + " ".join(figure["text"])) + "\n"
+        text += _wrapped(f"*{figure['title']}.* " + figure["text"][0]) + "\n"
     return text
 
 
