@@ -141,7 +141,12 @@ def own_flags(command: str) -> Callable[[Record], str]:
         left_out = [f"`{one.flag}`" for one in as_in_attack if one.flag not in flags_of(command)]
         few = len(left_out) < 4
         said = f"All flags of `attack` but {', '.join(left_out)}" if few else f"As for `attack`: {', '.join(shared)}"
+        known_values = {one.flag: _flag_row(one)[2] for one in as_in_attack}
         own = [_flag_row(one) for one in known if one not in as_in_attack]
+        for row in own:
+            flag, _, values, _ = row
+            if values and known_values.get(flag.strip("`")) == values:
+                row[2] = "as for `attack`"
         return _wrapped(f"{said}.") + ("\n" + table(FLAG_HEADS, own) if own else "")
 
     return make
@@ -335,11 +340,8 @@ def _field(field: FieldInfo | ComputedFieldInfo) -> str:
 
 
 def _inside(kind: type[Fields]) -> str:
-    """The fields of what is in a field."""
-    return ", ".join(
-        f"`{part.alias or name}`" + (f" ({part.description})" if part.description else "")
-        for name, part in kind.model_fields.items()
-    )
+    """The names of the fields of what is in a field; their descriptions are in the JSON schema."""
+    return ", ".join(f"`{part.alias or name}`" for name, part in kind.model_fields.items())
 
 
 def _first_sentence(kind: type[Fields]) -> str:
