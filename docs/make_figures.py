@@ -141,12 +141,19 @@ def own_flags(command: str) -> Callable[[Record], str]:
         left_out = [f"`{one.flag}`" for one in as_in_attack if one.flag not in flags_of(command)]
         few = len(left_out) < 4
         said = f"All flags of `attack` but {', '.join(left_out)}" if few else f"As for `attack`: {', '.join(shared)}"
-        known_values = {one.flag: _flag_row(one)[2] for one in as_in_attack}
-        own = [_flag_row(one) for one in known if one not in as_in_attack]
-        for row in own:
-            flag, _, values, _ = row
-            if values and known_values.get(flag.strip("`")) == values:
+        rows_of_attack = {one.flag: _flag_row(one) for one in as_in_attack}
+        own, other_defaults = [], []
+        for row in (_flag_row(one) for one in known if one not in as_in_attack):
+            flag = row[0].strip("`")
+            same = rows_of_attack.get(flag)
+            if same is not None and same[:3] == row[:3] and row[3]:
+                other_defaults.append(f"{row[0]} ({row[3]})")
+                continue
+            if same is not None and row[2] and same[2] == row[2]:
                 row[2] = "as for `attack`"
+            own.append(row)
+        if other_defaults:
+            said += f". With another default: {', '.join(other_defaults)}"
         return _wrapped(f"{said}.") + ("\n" + table(FLAG_HEADS, own) if own else "")
 
     return make
