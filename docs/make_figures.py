@@ -143,9 +143,11 @@ def own_flags(command: str) -> Callable[[Record], str]:
         said = f"All flags of `attack` but {', '.join(left_out)}" if few else f"As for `attack`: {', '.join(shared)}"
         rows_of_attack = {one.flag: _flag_row(one) for one in as_in_attack}
         own, other_defaults = [], []
-        for row in (_flag_row(one) for one in known if one not in as_in_attack):
-            flag = row[0].strip("`")
-            same = rows_of_attack.get(flag)
+        for one in known:
+            if one in as_in_attack:
+                continue
+            row = _flag_row(one)
+            same = None if one.group in (command, "verification") else rows_of_attack.get(one.flag)
             if same is not None and same[:3] == row[:3] and row[3]:
                 other_defaults.append(f"{row[0]} ({row[3]})")
                 continue
