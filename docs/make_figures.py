@@ -141,7 +141,21 @@ def own_flags(command: str) -> Callable[[Record], str]:
         left_out = [f"`{one.flag}`" for one in as_in_attack if one.flag not in flags_of(command)]
         few = len(left_out) < 4
         said = f"All flags of `attack` but {', '.join(left_out)}" if few else f"As for `attack`: {', '.join(shared)}"
-        own = [_flag_row(one) for one in known if one not in as_in_attack]
+        rows_of_attack = {one.flag: _flag_row(one) for one in as_in_attack}
+        own, other_defaults = [], []
+        for one in known:
+            if one in as_in_attack:
+                continue
+            row = _flag_row(one)
+            same = None if one.group in (command, "verification") else rows_of_attack.get(one.flag)
+            if same is not None and same[:3] == row[:3] and row[3]:
+                other_defaults.append(f"{row[0]} ({row[3]})")
+                continue
+            if same is not None and row[2] and same[2] == row[2]:
+                row[2] = "as for `attack`"
+            own.append(row)
+        if other_defaults:
+            said += f". With another default: {', '.join(other_defaults)}"
         return _wrapped(f"{said}.") + ("\n" + table(FLAG_HEADS, own) if own else "")
 
     return make
@@ -335,11 +349,8 @@ def _field(field: FieldInfo | ComputedFieldInfo) -> str:
 
 
 def _inside(kind: type[Fields]) -> str:
-    """The fields of what is in a field."""
-    return ", ".join(
-        f"`{part.alias or name}`" + (f" ({part.description})" if part.description else "")
-        for name, part in kind.model_fields.items()
-    )
+    """The names of the fields of what is in a field; their descriptions are in the JSON schema."""
+    return ", ".join(f"`{part.alias or name}`" for name, part in kind.model_fields.items())
 
 
 def _first_sentence(kind: type[Fields]) -> str:
@@ -426,17 +437,18 @@ RECIPES = "images/recipes/results.json"
 
 
 def recipe_results(record: Record) -> str:
-    """What `docs/make_recipe_images.py` kept of each recipe, on bundled objects and on other data."""
+    """What `docs/make_recipe_images.py` kept of each recipe: on other data, or else on bundled objects."""
     path = DOCS / RECIPES
     kept = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return "\n".join(_recipe(name, kept.get(name, {})) for name in sorted({*kept, *recipe_names()}))
 
 
 def _recipe(name: str, found: Mapping[str, Any]) -> str:
-    text = f"### {name}\n"
-    for kind, how in (("bundled", "With `--quick`"), ("data", "On real data")):
-        text += "\n" + (_recipe_on(found[kind], how) if kind in found else f"**{how}**: not run yet.\n")
-    return text
+    text = f"### {name}\n\n"
+    for kind, how in (("data", "On real data"), ("bundled", "With `--quick`")):
+        if kind in found:
+            return text + _recipe_on(found[kind], how)
+    return text + "Not run yet.\n"
 
 
 def _recipe_on(told: Mapping[str, Any], how: str) -> str:
@@ -448,7 +460,7 @@ def _recipe_on(told: Mapping[str, Any], how: str) -> str:
     text = _wrapped(f"**{how}**: {what} in {places}, seen by {models}; {told['renders']} renders{took}.") + "\n"
     for figure in told["figures"]:
         text += f"![{figure['title']}](images/recipes/{figure['image']})\n\n"
-        text += _wrapped(f"*{figure['title']}.* " + " ".join(figure["text"])) + "\n"
+        text += _wrapped(f"*{figure['title']}.* " + figure["text"][0]) + "\n"
     return text
 
 
