@@ -26,8 +26,8 @@ from advsearch.files import is_shallow
 from advsearch.models import Model
 from advsearch.options import told
 from advsearch.progress import watched
-from advsearch.registry import allow_named
 from advsearch.settings import Config, PythonOnly, as_python, settings
+from advsearch.trust.code import allow_named
 
 Names = str | Sequence[str]  # names in a list, or in a text with commas between them
 LOADED = (loading.Scene, Model, nn.Module)  # what a question may be given in place of a name

@@ -32,7 +32,6 @@ from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.sweep.result import SweepResult
 from advsearch.questions.sweep.summary import SweepSummary
-from advsearch.registry import allow_named, names_code
 from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
 from advsearch.runs.files import read_png
 from advsearch.runs.results import RenderResult, Result
@@ -41,6 +40,7 @@ from advsearch.scene.formation import aovs_of
 from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.hdr import read_exr
 from advsearch.tasks import AnyTask, make_task
+from advsearch.trust.code import allow_named, names_code
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

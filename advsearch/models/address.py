@@ -45,7 +45,7 @@ from advsearch.models.model import Model, Preprocessing
 from advsearch.models.source import Purpose
 from advsearch.models.zoo.language import QUESTION, SIDE
 from advsearch.pictures import png_of
-from advsearch.registry import how_to_allow, may_fetch
+from advsearch.trust.code import how_to_allow, may_fetch
 
 KEY = "ADVSEARCH_MODEL_KEY"  # the environment variable with the key that is sent as ``Authorization: Bearer``
 CHAT = "/chat/completions"  # how the path of an address ends that is asked as OpenAI's chat is

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from advsearch import files
 from advsearch.models.model import CPU
-from advsearch.registry import OWN_FOLDER
+from advsearch.trust.code import OWN_FOLDER
 
 LONGEST = 120  # seconds that a file's first passes may take each, and its loading, where that runs a part of it
 GRACE = 5  # seconds for a call to end that was asked to

@@ -28,9 +28,9 @@ from advsearch.questions.attack.carry_out import parts_in
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import attacks_of
 from advsearch.questions.photographs.carry_out import Photographs
-from advsearch.registry import allow_named, allowed_code, nothing_allowed
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER
+from advsearch.trust.code import allow_named, allowed_code, nothing_allowed
 
 PLANTED = "open('imported', 'w').close()\nraise RuntimeError('planted')"
 NAME = "planted:make"

@@ -10,7 +10,6 @@ import yaml
 from stored_sweeps import make_sweep
 
 import advsearch
-from advsearch import registry
 from advsearch.cli.flags import IN_A_FILE as COMMANDS
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS
@@ -23,6 +22,7 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER, power, settings
 from advsearch.threads import cores
+from advsearch.trust.code import allow_code
 
 MANY = 100_000
 POWERS: dict[str, Any] = {
@@ -199,4 +199,4 @@ def test_python_gives_power_by_keyword() -> None:
     config = AttackConfig(object="mug", workers=MANY, cluster="tcp://127.0.0.1:1", log="wandb")
     assert (config.workers, config.cluster, config.log) == (MANY, "tcp://127.0.0.1:1", "wandb")
     assert [one.name for one in config.powers] == ["log", "workers", "cluster"]
-    assert advsearch.allow_code is registry.allow_code
+    assert advsearch.allow_code is allow_code

@@ -25,8 +25,8 @@ from advsearch.cli.main import main
 from advsearch.errors import InputError, ModelError
 from advsearch.models import address
 from advsearch.models.address import KEY, AskedModel, checked, is_local
-from advsearch.registry import nothing_allowed
 from advsearch.tasks import make_task
+from advsearch.trust.code import nothing_allowed
 
 SECRET = "sk-very-secret"
 SMALL = ["--object", "mug", "--resolution", "24", "--spp", "2", "--verify-spp", "4", "--trials", "6", "--quiet"]

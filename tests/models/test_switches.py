@@ -12,7 +12,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.models import load_model
 from advsearch.models.guards import PLAIN, Switches, plainly
-from advsearch.registry import allow_code
+from advsearch.trust.code import allow_code
 
 TURNED = {
     "type": Switches(dtype=torch.float64),

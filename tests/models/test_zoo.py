@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from advsearch.errors import FileFormatError, ModelError, UnknownNameError
 from advsearch.models import ModelWarning, load_model
 from advsearch.models.zoo.library import reading
-from advsearch.registry import allow_named, nothing_allowed
 from advsearch.tasks import Detection
+from advsearch.trust.code import allow_named, nothing_allowed
 
 IMAGES = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
 

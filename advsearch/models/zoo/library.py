@@ -28,7 +28,7 @@ from advsearch.errors import CodeNotAllowedError, ModelError
 from advsearch.models.model import Triple, warn
 from advsearch.models.probe import first_line
 from advsearch.models.source import Purpose, Source, source_of
-from advsearch.registry import how_to_allow, may_fetch
+from advsearch.trust.code import how_to_allow, may_fetch
 
 
 def library(name: str, spec: str, extra: str) -> Any:

@@ -27,7 +27,6 @@ from advsearch.engine.record import KEPT, Findings
 from advsearch.engine.rendering import Rendering, pictures_of, render
 from advsearch.errors import InputError
 from advsearch.questions.attack.summary import AlongDrive, AttackSummary
-from advsearch.registry import names_code
 from advsearch.report.figures import marked, new_axes, search_axes
 from advsearch.report.shown import result_html, shown, side_by_side
 from advsearch.runs import files, store
@@ -42,6 +41,7 @@ from advsearch.scene.glb import web_glb
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 from advsearch.tasks import Judgement, Mark
+from advsearch.trust.code import names_code
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

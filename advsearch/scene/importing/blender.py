@@ -18,8 +18,8 @@ from pathlib import Path
 
 from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.registry import OWN_FOLDER
 from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, read_bytes, run_converter, shown
+from advsearch.trust.code import OWN_FOLDER
 
 # ---------------------------------------------------------------------------------------------------------------------
 # OpenUSD files through glTF, which a process of its own makes of them with `usd-core`: readers of binary formats are
