@@ -12,7 +12,6 @@ and lets no script run but those of this package. A photograph needs the key tha
 from __future__ import annotations
 
 import hmac
-import ipaddress
 import json
 import os
 import re
@@ -37,8 +36,9 @@ from advsearch.report.shown import Html, element, join_html
 from advsearch.runs import directory, files, listing, store
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
 from advsearch.runs.results import plain
+from advsearch.trust.network import https_context, is_address, is_local
 from advsearch.viewer import clients
-from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, Refused, https_context, is_address, reachable
+from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, Refused, reachable
 from advsearch.viewer.columns import packed, read_columns
 from advsearch.viewer.document import (
     data_script,
@@ -180,8 +180,7 @@ class Dashboard(HTTPServer):
             while name in self._given:
                 name, number = f"{path.resolve().name} ({number})", number + 1
             self._given[name] = path
-        here = host == "localhost" or (is_address(host) and ipaddress.ip_address(host).is_loopback)
-        self.token = None if here else secrets.token_urlsafe(24)
+        self.token = None if is_local(host) else secrets.token_urlsafe(24)
         self._secret, self.photographs = secrets.token_bytes(32), photographs
         self._listing = threading.Lock()
         self._host, self.fingerprint = host, None
