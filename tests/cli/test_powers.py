@@ -189,7 +189,7 @@ def test_a_part_has_the_workers_of_who_asks(monkeypatch: pytest.MonkeyPatch) -> 
     text = (path / "run.yaml").read_text()
     (path / "run.yaml").write_text(text.replace("workers: null", "workers: 1").replace("log: null", "log: wandb"))
     seen: list[Any] = []
-    monkeypatch.setattr(studies, "carry_out", lambda config, **_: seen.append(config))
+    monkeypatch.setattr(studies, "run_experiment", lambda config, **_: seen.append(config))
     for workers in (3, None):
         asked = SweepConfig(object="mug", grid={"pose.yaw": [0.0]}, workers=workers)
         studies.carry_out_part(path, asked, NullProgress())
