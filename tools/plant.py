@@ -221,7 +221,7 @@ FAULTS = (
     ),
     Fault(
         "runs: two processes may hold a lock",
-        "advsearch/runs/files.py",
+        "advsearch/trust/writing.py",
         "fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)",
         "fcntl.flock(self._descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)",
         ("tests/engine/test_resume.py", "tests/runs/test_runs.py"),

@@ -48,8 +48,8 @@ def report(args: argparse.Namespace) -> int:
     # late, so that --help answers at once
     from advsearch.questions.report.evidence import collected, read_exposure
     from advsearch.questions.report.result import evidence_page, markdown
-    from advsearch.runs.files import write_bytes, write_text
     from advsearch.runs.summary import to_json
+    from advsearch.trust.writing import write_bytes, write_text
 
     if not args.evidence:
         raise InputError(

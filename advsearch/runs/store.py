@@ -19,18 +19,9 @@ from numpy.typing import NDArray
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue, parse_json
 from advsearch.options import Value
-from advsearch.runs.files import (
-    DAMAGED,
-    check_schema,
-    check_there,
-    check_version,
-    connect_to_read,
-    connect_to_write,
-    note_open,
-    readable,
-    storage_errors,
-)
+from advsearch.runs.files import DAMAGED, check_schema, check_version, connect_to_read, connect_to_write, readable
 from advsearch.runs.results import plain
+from advsearch.trust.writing import check_there, note_open, storage_errors
 
 NAME = "results.sqlite"
 SYNC_INTERVAL = 1.0  # least seconds between two forced writes to the disk; what a power cut may cost

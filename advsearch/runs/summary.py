@@ -23,9 +23,9 @@ from pydantic import ValidationError
 from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import FileFormatError
 from advsearch.files import opened_for, parse_json, read_bytes, read_text, split_paths
-from advsearch.runs.files import is_held, write_bytes, write_text
 from advsearch.runs.results import RUNNING, Result, kind_of
 from advsearch.settings.configuration import FILES
+from advsearch.trust.writing import is_held, write_bytes, write_text
 
 NAME = "summary.json"
 LARGEST = 64 << 20

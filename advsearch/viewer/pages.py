@@ -20,9 +20,10 @@ from advsearch.report import shown as showing
 from advsearch.report.shown import Html, Picture, ResultPart, ShownResult, element, join_html
 from advsearch.report.wording import is_command
 from advsearch.runs.directory import CONFIG, IMAGES, OBJECT_FILE, REPORT, RunDirectory
-from advsearch.runs.files import smaller_png, write_text
+from advsearch.runs.files import smaller_png
 from advsearch.runs.results import Result
 from advsearch.runs.summary import read_result
+from advsearch.trust.writing import write_text
 from advsearch.viewer import document
 
 LARGEST_FIGURE = 2_000_000  # bytes of a figure or a picture that the page takes along

@@ -33,10 +33,11 @@ from advsearch.questions.photographs import result as photos
 from advsearch.questions.sweep.page import SweepSource, result_of, sweep_page_html
 from advsearch.report import wording
 from advsearch.report.shown import Html, element, join_html
-from advsearch.runs import directory, files, listing, store
+from advsearch.runs import directory, listing, store
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
 from advsearch.runs.results import plain
 from advsearch.trust.network import https_context, is_address, is_local
+from advsearch.trust.writing import is_held
 from advsearch.viewer import clients
 from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, Refused, reachable
 from advsearch.viewer.columns import packed, read_columns
@@ -98,7 +99,7 @@ START = 0  # where a page begins: the last row that it has
 
 def is_under_way(run: Path) -> bool:
     """Whether a run has no page that says what came out: none at all, or one of an attack that is being resumed."""
-    return not (run / REPORT).is_file() or (files.is_held(run) and listing.can_resume(run))
+    return not (run / REPORT).is_file() or (is_held(run) and listing.can_resume(run))
 
 
 def following_page(name: str, run: Path) -> str:
@@ -127,7 +128,7 @@ def following_page(name: str, run: Path) -> str:
 def progress_json(run: Path, after: int) -> bytes:
     """Return what is new in a run as JSON, after what `next` was in the answer before, or `START`. Raises
     FileFormatError where what it keeps is damaged."""
-    running, ended = files.is_held(run), not is_under_way(run)  # before what it has: what comes later is asked for
+    running, ended = is_held(run), not is_under_way(run)  # before what it has: what comes later is asked for
     last, rows, pictures = after, list[dict[str, object]](), list[dict[str, object]]()
     if (run / store.NAME).is_file():
         with store.Store(run / store.NAME, read_only=True) as results:
@@ -402,7 +403,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not after and (run / COLUMNS).is_file() and listing.finished(run):
             return Served("application/octet-stream", read_bytes(run / COLUMNS, "columns of a sweep", LARGEST))
         part = PART if after else FIRST_PART
-        running = files.is_held(run)  # before the rows are read: what comes later is asked for again
+        running = is_held(run)  # before the rows are read: what comes later is asked for again
         columns = read_columns(run, after, part)
         return Served("application/octet-stream", packed(columns, more=len(columns) == part, running=running))
 

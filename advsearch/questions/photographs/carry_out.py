@@ -34,12 +34,12 @@ from advsearch.questions.photographs.result import LOOSE_PHOTO, PHOTO, PhotoAgre
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
-from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.settings import read_yaml
 from advsearch.tasks import AnyTask, Judgement, Task, make_task
 from advsearch.tasks.base import Truth
 from advsearch.tasks.together import Together
+from advsearch.trust.writing import write_bytes
 from advsearch.viewer.clients import LARGEST_SENT
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")  # of the files in a folder that are photographs

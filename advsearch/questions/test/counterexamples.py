@@ -34,11 +34,12 @@ from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.test.result import FAILED, HELD, UNDECIDED, VERDICTS
 from advsearch.questions.test.settings import Suite
 from advsearch.runs.directory import IMAGES, PARTS, default_name, find_run
-from advsearch.runs.files import read_png, write_bytes, write_text
+from advsearch.runs.files import read_png
 from advsearch.runs.summary import changed_file, file_digests
 from advsearch.settings import FILES, settings
 from advsearch.settings.configuration import PLACE
 from advsearch.tasks import Judgement
+from advsearch.trust.writing import write_bytes, write_text
 from advsearch.viewer.thumbnails import thumbnail
 
 Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
