@@ -36,7 +36,6 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import CodeNotAllowedError, InputError, ModelError, UnknownNameError
-from advsearch.files import parse_json, scaled
 from advsearch.interrupts import INTERRUPTS
 from advsearch.models.model import Model, Preprocessing
 from advsearch.models.source import Purpose
@@ -44,6 +43,7 @@ from advsearch.models.zoo.language import QUESTION, SIDE
 from advsearch.pictures import png_of
 from advsearch.trust.code import how_to_allow, may_fetch
 from advsearch.trust.network import KEY, NoRedirect, check_address, is_local, read_key
+from advsearch.trust.stored_files import parse_json, scaled
 
 CHAT = "/chat/completions"  # how the path of an address ends that is asked as OpenAI's chat is
 

@@ -19,9 +19,9 @@ from typing import Any, BinaryIO
 
 import torch
 
-from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.models.probe import first_line
+from advsearch.trust.stored_files import parse_json, scaled, too_large
 
 LARGEST = 16 << 30  # bytes of a model file, and of what it unpacks to
 LARGEST_TEXT = 64 << 20  # bytes of a member that describes the network: JSON, source code, a pickle of names
@@ -49,8 +49,8 @@ class Archive:
         if name not in self.members:
             raise refused(self.path, f"has no {name!r}, so it is not complete")
         size = self.members[name].file_size
-        if size > files.scaled(limit):
-            raise files.too_large(self.path, f"{name!r} of at most {files.scaled(limit):,} bytes in it", f"{size:,}")
+        if size > scaled(limit):
+            raise too_large(self.path, f"{name!r} of at most {scaled(limit):,} bytes in it", f"{size:,}")
         try:
             return self.zip.read(self.members[name])
         except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, NotImplementedError) as error:
@@ -59,7 +59,7 @@ class Archive:
     def read_json(self, name: str) -> Any:
         """Return the value of a member that is JSON; errors as for `read`, and where it is not JSON."""
         try:
-            return files.parse_json(self.read(name, LARGEST_TEXT))
+            return parse_json(self.read(name, LARGEST_TEXT))
         except ValueError as error:
             raise refused(self.path, f"expected JSON in {name!r}, got {first_line(error)}") from None
 
@@ -73,13 +73,13 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise truncated(path, error) from None
     unpacked, limit = sum(entry.file_size for entry in entries), ""
-    if unpacked > files.scaled(LARGEST):
-        limit, got = f"a model of at most {files.scaled(LARGEST):,} bytes unpacked", f"{unpacked:,}"
-    elif unpacked > files.scaled(LARGEST_RATIO) * size + SLACK:
-        limit = f"a model that unpacks to at most {files.scaled(LARGEST_RATIO)} times its size"
+    if unpacked > scaled(LARGEST):
+        limit, got = f"a model of at most {scaled(LARGEST):,} bytes unpacked", f"{unpacked:,}"
+    elif unpacked > scaled(LARGEST_RATIO) * size + SLACK:
+        limit = f"a model that unpacks to at most {scaled(LARGEST_RATIO)} times its size"
         got = f"{size:,} bytes that unpack to {unpacked:,}"
     if limit:
-        raise files.too_large(path, limit, got)
+        raise too_large(path, limit, got)
     roots = {entry.filename.partition("/")[0] if "/" in entry.filename else "" for entry in entries}
     root = f"{roots.pop()}/" if len(roots) == 1 and "" not in roots else ""
     members = {entry.filename.removeprefix(root): entry for entry in entries}

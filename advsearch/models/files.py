@@ -21,7 +21,6 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.errors import FileFormatError, ModelError
-from advsearch.files import open_regular
 from advsearch.models import exported
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.archive import LARGEST, Archive, open_archive, refused, rewritten_torchscript
@@ -31,6 +30,7 @@ from advsearch.models.labels import names_in
 from advsearch.models.probe import foreign
 from advsearch.models.source import Source, source_of
 from advsearch.models.zoo.library import library, without_unpickling
+from advsearch.trust.stored_files import open_regular
 
 #: Suffixes that make a name a file even if there is no such file.
 SUFFIXES = (".pt2", ".pt", ".pth", ".ts", ".torchscript", ".bin", ".pkl", ".pickle", ".ckpt", ".safetensors", ".onnx")

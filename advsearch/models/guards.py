@@ -19,9 +19,9 @@ from typing import Any, TypeVar, final
 import torch
 from torch import Tensor, nn
 
-from advsearch import files
 from advsearch.models.model import CPU
 from advsearch.trust.code import OWN_FOLDER
+from advsearch.trust.stored_files import FACTOR, scaled
 
 LONGEST = 120  # seconds that a file's first passes may take each, and its loading, where that runs a part of it
 GRACE = 5  # seconds for a call to end that was asked to
@@ -35,7 +35,7 @@ class TookTooLong(Exception):
 
     def __init__(self) -> None:
         super().__init__(
-            f"no answer within {files.scaled(LONGEST)} seconds; if you trust it, {files.FACTOR}=10 in the environment "
+            f"no answer within {scaled(LONGEST)} seconds; if you trust it, {FACTOR}=10 in the environment "
             "waits ten times as long"
         )
 
@@ -55,7 +55,7 @@ def within(call: Callable[[], Result], stop: Callable[[], None] | None = None) -
 
     thread = threading.Thread(target=work, daemon=True)  # a daemon's: the process may end before it
     thread.start()
-    thread.join(files.scaled(LONGEST))
+    thread.join(scaled(LONGEST))
     if thread.is_alive():
         if stop is not None:
             stop()
@@ -70,7 +70,11 @@ def try_torchscript(archive: io.BytesIO) -> str:
     command = [sys.executable, "-W", "ignore", "-c", _TRIAL]
     try:
         done = subprocess.run(
-            command, input=archive.getbuffer(), capture_output=True, timeout=files.scaled(LONGEST), cwd=OWN_FOLDER
+            command,
+            input=archive.getbuffer(),
+            capture_output=True,
+            timeout=scaled(LONGEST),
+            cwd=OWN_FOLDER,
         )
     except subprocess.TimeoutExpired:
         return str(TookTooLong())

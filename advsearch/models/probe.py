@@ -12,13 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from advsearch import files
 from advsearch.errors import AdvsearchError, ModelError
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.guards import TookTooLong, WithState, within
 from advsearch.models.inputs import EightBitInput, WithImageSize
 from advsearch.models.labels import fitting_labels
 from advsearch.models.model import Detaching, Model, logits_of, read_by, tensors_in, warn
+from advsearch.trust.stored_files import FACTOR, scaled
 
 PROBABILITY_TOLERANCE = 1e-3  # rows that are non-negative and sum to 1 within this are taken for probabilities
 PERCENT_TOLERANCE = 5e-3  # rows that are non-negative and sum to 100 within this share of it, for percentages
@@ -73,10 +73,10 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
             or no gradient reaches the image.
     """
     (height, width), count = model.input_size, max(model.batch_limits[0], 1)
-    if count * height * width > files.scaled(LARGEST):
+    if count * height * width > scaled(LARGEST):
         raise ModelError(
             f"model {model.name}: takes {count:,} images of {height:,} x {width:,} pixels at once, expected at most "
-            f"{files.scaled(LARGEST):,} pixels; if you trust it, {files.FACTOR}=10 in the environment allows ten times "
+            f"{scaled(LARGEST):,} pixels; if you trust it, {FACTOR}=10 in the environment allows ten times "
             "as many"
         )
     grey = torch.full((1, height, width, 3), 0.5)

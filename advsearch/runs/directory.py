@@ -14,10 +14,10 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
-from advsearch.files import open_regular
 from advsearch.runs import files, store, summary
 from advsearch.runs.trackers import Tracker, check_tracker
 from advsearch.settings import HEADER, PythonOnly, settings
+from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import (
     LOCK,
     PART,
@@ -28,7 +28,7 @@ from advsearch.trust.writing import (
     write_bytes,
     write_text,
 )
-from advsearch.yaml_text import LARGEST
+from advsearch.trust.yaml_text import LARGEST
 
 if TYPE_CHECKING:
     from advsearch.runs.results import Result

@@ -19,8 +19,8 @@ import numpy.typing as npt
 from PIL import Image
 
 from advsearch.errors import FileFormatError
-from advsearch.files import open_regular
 from advsearch.pictures import png_of
+from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import replacing, storage_errors, write_bytes
 
 DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run again"

@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advsearch.errors import FileFormatError
-from advsearch.files import JsonValue, parse_json
+from advsearch.files import JsonValue
 from advsearch.options import Value
 from advsearch.runs.files import DAMAGED, check_schema, check_version, connect_to_read, connect_to_write, readable
 from advsearch.runs.results import plain
+from advsearch.trust.stored_files import parse_json
 from advsearch.trust.writing import check_there, note_open, storage_errors
 
 NAME = "results.sqlite"

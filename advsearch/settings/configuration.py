@@ -16,9 +16,10 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
-from advsearch.files import JsonObject, is_shallow, split_paths
+from advsearch.files import JsonObject, split_paths
 from advsearch.settings import values as written
 from advsearch.trust.powers import LeftOut, Power, none
+from advsearch.trust.stored_files import is_shallow
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo

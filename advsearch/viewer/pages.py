@@ -15,7 +15,6 @@ from typing import TypeVar
 
 from advsearch import registry
 from advsearch.errors import FileFormatError
-from advsearch.files import read_bytes
 from advsearch.report import shown as showing
 from advsearch.report.shown import Html, Picture, ResultPart, ShownResult, element, join_html
 from advsearch.report.wording import is_command
@@ -23,6 +22,7 @@ from advsearch.runs.directory import CONFIG, IMAGES, OBJECT_FILE, REPORT, RunDir
 from advsearch.runs.files import smaller_png
 from advsearch.runs.results import Result
 from advsearch.runs.summary import read_result
+from advsearch.trust.stored_files import read_bytes
 from advsearch.trust.writing import write_text
 from advsearch.viewer import document
 

@@ -28,7 +28,6 @@ from typing import Any, NamedTuple
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from advsearch.errors import AdvsearchError, InputError
-from advsearch.files import read_bytes
 from advsearch.questions.photographs import result as photos
 from advsearch.questions.sweep.page import SweepSource, result_of, sweep_page_html
 from advsearch.report import wording
@@ -37,6 +36,7 @@ from advsearch.runs import directory, listing, store
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
 from advsearch.runs.results import plain
 from advsearch.trust.network import https_context, is_address, is_local
+from advsearch.trust.stored_files import read_bytes
 from advsearch.trust.writing import is_held
 from advsearch.viewer import clients
 from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, Refused, reachable

@@ -29,7 +29,6 @@ from hypothesis import strategies as st
 from samples import attack, exr, rated, sweep
 
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
-from advsearch.files import open_regular
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs import directory, files, summary
@@ -40,6 +39,7 @@ from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.results import Result, plain
 from advsearch.runs.store import Row, Store
 from advsearch.runs.summary import read_result
+from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import PART, RunLock, replacing, write_bytes, write_text
 
 WRITER = """

@@ -21,7 +21,6 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from advsearch import seeds
 from advsearch.engine.problem import Problem
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.files import parse_json, read_text
 from advsearch.models import Model
 from advsearch.models.reference import Trainable
 from advsearch.pictures import upright
@@ -33,6 +32,7 @@ from advsearch.scene.formation import levels_of
 from advsearch.tasks import Task, make_task
 from advsearch.tasks.boxes import Place
 from advsearch.tasks.segmentation import Region, Segmentation
+from advsearch.trust.stored_files import parse_json, read_text
 from advsearch.trust.writing import write_bytes
 
 Target = dict[str, Tensor]

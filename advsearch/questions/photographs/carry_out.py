@@ -24,7 +24,7 @@ from advsearch.engine.naming import in_turn
 from advsearch.engine.record import judged
 from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import JsonObject, read_bytes
+from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import Value
 from advsearch.questions.attack.carry_out import judged_alone, problem_from_config
@@ -39,6 +39,7 @@ from advsearch.settings import read_yaml
 from advsearch.tasks import AnyTask, Judgement, Task, make_task
 from advsearch.tasks.base import Truth
 from advsearch.tasks.together import Together
+from advsearch.trust.stored_files import read_bytes
 from advsearch.trust.writing import write_bytes
 from advsearch.viewer.clients import LARGEST_SENT
 

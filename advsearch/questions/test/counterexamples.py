@@ -26,7 +26,6 @@ from advsearch.engine.loading import Scene
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import parse_json, read_text
 from advsearch.options import OUT_OF_VIEW
 from advsearch.questions.attack.carry_out import parts_in, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
@@ -39,6 +38,7 @@ from advsearch.runs.summary import changed_file, file_digests
 from advsearch.settings import FILES, settings
 from advsearch.settings.configuration import PLACE
 from advsearch.tasks import Judgement
+from advsearch.trust.stored_files import parse_json, read_text
 from advsearch.trust.writing import write_bytes, write_text
 from advsearch.viewer.thumbnails import thumbnail
 

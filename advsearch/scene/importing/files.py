@@ -23,8 +23,10 @@ from urllib.parse import unquote
 import numpy as np
 import numpy.typing as npt
 
-from advsearch import files
 from advsearch.errors import FileFormatError
+from advsearch.files import either
+from advsearch.trust import stored_files
+from advsearch.trust.stored_files import FACTOR, scaled, too_large
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Files of objects and cameras that are not read: what they are, and the program and command that convert them.
@@ -97,7 +99,7 @@ def advice(path: Path) -> str | None:
     return next((f"{what}: {how.format(file=shlex.quote(name), **names)}" for what, how in said), None)
 
 
-LARGEST_FILE = 1 << 29  # bytes that a mesh, a texture or an environment may have, before `advsearch.files.scaled`
+LARGEST_FILE = 1 << 29  # bytes that a mesh, a texture or an environment may have, before `scaled`
 _LONGEST_NAME = 100
 _KINDS = (
     (b"\x89PNG", "a PNG picture"),
@@ -138,12 +140,12 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
                 raise FileFormatError(f"{file}: has no parts by name, got #{shown(part, quoted=False)}; leave it out")
             known = None if what == "environment" else advice(Path(file) if file else path)
             if known is not None:
-                raise FileFormatError(f"{path}: {known} (read are {files.either(suffixes)})")
+                raise FileFormatError(f"{path}: {known} (read are {either(suffixes)})")
             got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
             raise FileFormatError(
-                f"{path}: expected an {what} file ending in {files.either(suffixes)}, {got}; convert it to one of these"
+                f"{path}: expected an {what} file ending in {either(suffixes)}, {got}; convert it to one of these"
             )
-        data = files.read_bytes(path, f"an {what} file", LARGEST_FILE)
+        data = stored_files.read_bytes(path, f"an {what} file", LARGEST_FILE)
     except FileNotFoundError as error:
         hint = "" if path.parent.is_dir() else f" The folder {path.parent} does not exist either."
         with suppress(OSError):
@@ -236,15 +238,15 @@ def clean(name: str) -> str:
 
 
 LARGEST_FACES = 2_000_000
-"""Triangles that a mesh may have, before `advsearch.files.scaled`; each takes over 1 KB of memory to import."""
+"""Triangles that a mesh may have, before `scaled`; each takes over 1 KB of memory to import."""
 MOST_CORNERS = 10_000  # corners that one face may have
 
 
 def check_most(path: Path | str, count: int, limit: int, expected: str, got: str | None = None) -> None:
-    """Raise FileFormatError where a file has more of something than a limit, before `advsearch.files.scaled`; what was
+    """Raise FileFormatError where a file has more of something than a limit, before `scaled`; what was
     expected has {} in the place of that, and what it got is the count by itself."""
-    if count > (most := files.scaled(limit)):
-        raise files.too_large(path, expected.format(f"{most:,}"), f"{count:,}" if got is None else got)
+    if count > (most := scaled(limit)):
+        raise too_large(path, expected.format(f"{most:,}"), f"{count:,}" if got is None else got)
 
 
 def check_faces(path: Path | str, count: int, got: str | None = None) -> None:
@@ -353,7 +355,7 @@ class References:
             raise FileFormatError(OUTSIDE if os.path.lexists(path) else MISSING)
         if path not in self._contents:
             try:
-                data = files.read_bytes(Path(path), "an ordinary file", LARGEST_FILE)
+                data = stored_files.read_bytes(Path(path), "an ordinary file", LARGEST_FILE)
                 check_most(path, self._size + len(data), LARGEST_FILE, "files of at most {} bytes in all")
             except FileFormatError as error:
                 raise FileFormatError(f"is not read ({str(error).removeprefix(f'{path}: ')})") from error
@@ -366,8 +368,8 @@ def run_converter(
     path: Path, program: str, command: Sequence[str], *, folder: str | Path, seconds: int, env: Mapping[str, str] | None
 ) -> subprocess.CompletedProcess[str]:
     """Run a program that makes glTF of the file at `path`, in a folder, and return what it said. Raises OSError: it
-    can't be started; FileFormatError: it takes longer than so many seconds, before `advsearch.files.scaled`."""
-    longest, unread = files.scaled(seconds), subprocess.DEVNULL
+    can't be started; FileFormatError: it takes longer than so many seconds, before `scaled`."""
+    longest, unread = scaled(seconds), subprocess.DEVNULL
     try:
         return subprocess.run(
             command, cwd=folder, env=env, stdin=unread, capture_output=True, errors="replace", timeout=longest
@@ -375,5 +377,5 @@ def run_converter(
     except subprocess.TimeoutExpired:
         raise FileFormatError(
             f"{path}: {program} had not read it after {longest} seconds; export glTF (.glb) from it yourself, or give "
-            f"it longer: {files.FACTOR}=10 in the environment makes all limits ten times as large"
+            f"it longer: {FACTOR}=10 in the environment makes all limits ten times as large"
         ) from None

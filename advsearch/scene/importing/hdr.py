@@ -27,7 +27,7 @@ from advsearch.scene.importing.files import check_most, damaged, looks_like, sho
 
 Plane = npt.NDArray[np.floating]
 Planes = tuple[Plane, Plane, Plane]
-LARGEST = 2 * LARGEST_PIXELS  # pixels times channels of a file (8192 x 4096 with 4), before `advsearch.files.scaled`
+LARGEST = 2 * LARGEST_PIXELS  # pixels times channels of a file (8192 x 4096 with 4), before `scaled`
 COLORS = {"r": "R", "red": "R", "g": "G", "green": "G", "b": "B", "blue": "B", "y": "Y", "ry": "RY", "by": "BY"}
 """Names of channels, in any case, and what they hold."""
 WHOLE = ("", "rgba", "rgb", "beauty", "combined", "color", "colour", "main", "image")

@@ -121,7 +121,7 @@ def _overlaps(source: int, target: int) -> sparse.csr_array:
 
 Kind = Literal["colours", "colours and alpha", "numbers"]  # what a picture holds
 LARGEST_SUM = 2 * LARGEST_PIXELS
-"""Pixels that the colour textures of a file may have in all, and those of numbers, before `advsearch.files.scaled`."""
+"""Pixels that the colour textures of a file may have in all, and those of numbers, before `scaled`."""
 UNREADABLE = "cannot be read as a picture"
 MOST_TEXTURES = 16
 """Materials whose textures are kept at `TEXTURE_LIMIT`; more are baked into one map, for which less will do."""

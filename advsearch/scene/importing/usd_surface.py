@@ -20,7 +20,6 @@ import numpy.typing as npt
 from PIL import Image
 from pxr import Ar, Usd, UsdShade
 
-from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.glb import GlbBuffer, mime_type
@@ -36,6 +35,7 @@ from advsearch.scene.importing.usd_pictures import (
     is_marked_srgb,
     is_of_8_bits,
 )
+from advsearch.trust import stored_files
 
 Array = npt.NDArray[Any]
 FIRST = Usd.TimeCode.EarliestTime()
@@ -241,7 +241,11 @@ class Surfaces:
         if is_inside and os.path.isfile(outer):
             try:
                 packaged = Ar.JoinPackageRelativePath(outer, inner) if inner else ""
-                data = read_packaged(packaged) if inner else files.read_bytes(Path(outer), "a picture", LARGEST_FILE)
+                data = (
+                    read_packaged(packaged)
+                    if inner
+                    else stored_files.read_bytes(Path(outer), "a picture", LARGEST_FILE)
+                )
             except KeyError:
                 data = None
         if data is None:

@@ -25,7 +25,7 @@ from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurfa
 GROUPING = frozenset(("g", "o"))  # statements that only name parts; all parts are joined
 FREE_FORM = "bmat bsp bzp cdc cdp con cstype curv curv2 deg end hole mg parm res scrv sp step surf trim vp".split()
 WITHOUT_FACES = {"p": "points", "l": "lines", **dict.fromkeys(FREE_FORM, "curves and curved surfaces")}
-MOST_NAMED = 10_000  # material files, and materials, that a file may name, before `advsearch.files.scaled`
+MOST_NAMED = 10_000  # material files, and materials, that a file may name, before `scaled`
 BEYOND = 0.01  # how far texture coordinates may lie outside of a texture before it matters how that goes on
 
 
