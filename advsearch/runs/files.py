@@ -5,12 +5,9 @@ from __future__ import annotations
 import errno
 import io
 import os
-import re
 import sqlite3
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
-from functools import cache
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +17,18 @@ from PIL import Image
 
 from advsearch.errors import FileFormatError
 from advsearch.pictures import png_of
+from advsearch.trust.databases import (
+    LARGEST,
+    check_before_writing,
+    connect_to_read,
+    protect,
+    read_schema,
+    read_version,
+    readable,
+)
 from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import replacing, storage_errors, write_bytes
 
-DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run again"
-LARGEST = 64 << 30
-MAX_SCHEMA_ENTRIES = 100  # of a results.sqlite that are looked at; ours has fewer than ten
 APPLICATION_ID = 0x41445653  # in the header of every results.sqlite that is ours: "ADVS"
 VERSION = 9
 """Of the tables; in the header of the file. Files of another version are read by the advsearch that wrote them."""
@@ -78,9 +81,6 @@ SCHEMA = f"""
     PRAGMA user_version = {VERSION};
 """
 
-_JOURNAL = bytes.fromhex("d9d505f920a163d7")
-"""The last bytes of a journal that names a file (https://www.sqlite.org/fileformat2.html)."""
-
 
 def is_results_database(path: Path) -> bool:
     """Return whether the file at `path` starts like a results.sqlite of advsearch; a link does not."""
@@ -97,68 +97,16 @@ def is_results_database(path: Path) -> bool:
 def is_bare(path: Path) -> bool:
     """Return whether a file of ours has no tables yet: its process was killed as it made them."""
     with readable(path), closing(connect_to_read(path)) as db:
-        return _version(db) == 0 and not _schema(db)
-
-
-@contextmanager
-def readable(path: Path) -> Iterator[None]:
-    """Turn what SQLite says of a damaged file inside the block into an error that names it."""
-    try:
-        yield
-    except (sqlite3.Error, UnicodeDecodeError) as error:
-        text = repr(str(error))[1:-1][:200]  # it quotes what is in the file
-        raise FileFormatError(f"{path}: expected a results.sqlite of advsearch, got {text}; {DAMAGED}") from error
-
-
-def check_schema(db: sqlite3.Connection, path: Path) -> None:
-    """Check that the file has what `SCHEMA` makes and no more: a view or a trigger is code, and may never end."""
-    if _schema(db) != _own_schema():
-        db.close()
-        raise FileFormatError(f"{path}: expected the tables of a run, got others; {DAMAGED}")
-
-
-@cache
-def _own_schema() -> Counter[Any]:
-    with closing(sqlite3.connect(":memory:")) as db:
-        db.executescript(SCHEMA)
-        return _schema(db)
-
-
-def _schema(db: sqlite3.Connection) -> Counter[Any]:
-    """Return every entry of the schema, whatever its name: type, name, table and statement.
-
-    Statements are compared without comments and line breaks, which mean nothing to SQLite.
-    """
-    entries = db.execute("SELECT type, name, tbl_name, sql FROM sqlite_master").fetchmany(MAX_SCHEMA_ENTRIES)
-    return Counter((*names, None if sql is None else _without_comments(str(sql))) for *names, sql in entries)
-
-
-def _without_comments(statement: str) -> str:
-    without_comments = "\n".join(line.partition("--")[0] for line in statement.split("\n"))
-    return re.sub("[ \n]+", " ", without_comments).strip(" ")
-
-
-def _protect(db: sqlite3.Connection) -> None:
-    """Let a stranger's file call no function of its own choosing, and let SQLite look at each page that it reads.
-
-    Nothing here needs the schema, so nothing of the file's own statements has run by then.
-    """
-    db.execute("PRAGMA trusted_schema = OFF")
-    db.execute("PRAGMA writable_schema = OFF")
-    db.execute("PRAGMA cell_size_check = ON")
-    db.execute("PRAGMA mmap_size = 0")
+        return read_version(db) == 0 and not read_schema(db)
 
 
 def connect_to_write(path: Path) -> sqlite3.Connection:
-    if os.path.islink(path):
-        raise FileFormatError(f"{path}: expected a file of this run, got a link to another; {DAMAGED}")
-    if path.exists():
-        open_regular(path, "a results.sqlite", LARGEST).close()
-    _check_journal(path.with_name(f"{path.name}-journal"))
+    check_before_writing(path)
     with storage_errors(path):
         db = sqlite3.connect(path)
-        _protect(db)
-        if _version(db) == 0 and not _schema(db):  # there is nothing in it to lose yet, so the disk isn't waited for
+        protect(db)
+        if read_version(db) == 0 and not read_schema(db):
+            # there is nothing in it to lose yet, so the disk isn't waited for
             db.execute("PRAGMA synchronous = OFF")
             db.execute(f"PRAGMA application_id = {APPLICATION_ID}")  # before the log, so that the file itself has it
             db.execute("PRAGMA journal_mode = WAL")
@@ -166,38 +114,9 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
     return db
 
 
-def _check_journal(journal: Path) -> None:
-    """Refuse a journal that ends with the name of a file: SQLite would delete that file. None of ours does."""
-    if not os.path.lexists(journal):
-        return
-    with open_regular(journal, "a journal of SQLite", LARGEST) as file:
-        file.seek(-min(len(_JOURNAL), os.fstat(file.fileno()).st_size), os.SEEK_END)
-        if file.read() == _JOURNAL:
-            raise FileFormatError(f"{journal}: expected the journal of one file, got one that names another; remove it")
-
-
-def connect_to_read(path: Path) -> sqlite3.Connection:
-    """Open the file for reading; where the log's index can't be made (a read-only disk), as one that never changes."""
-    if not os.path.isfile(path):
-        raise FileFormatError(f"{path}: expected the results of a run, got no such file; check the name of the run")
-    address = path.resolve().as_uri()
-    db = sqlite3.connect(f"{address}?mode=ro", uri=True)
-    try:
-        _version(db)
-    except sqlite3.OperationalError:
-        db.close()
-        db = sqlite3.connect(f"{address}?immutable=1", uri=True)
-    _protect(db)
-    return db
-
-
-def _version(db: sqlite3.Connection) -> int:
-    return int(db.execute("PRAGMA user_version").fetchone()[0])
-
-
 def check_version(db: sqlite3.Connection, path: Path) -> None:
     """Refuse, by a FileFormatError, a file of another version, and say which advsearch reads it."""
-    version, day = _version(db), ""
+    version, day = read_version(db), ""
     if version == VERSION:
         return
     with suppress(sqlite3.Error):

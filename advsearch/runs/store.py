@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
 from advsearch.options import Value
-from advsearch.runs.files import DAMAGED, check_schema, check_version, connect_to_read, connect_to_write, readable
+from advsearch.runs.files import SCHEMA, check_version, connect_to_write
 from advsearch.runs.results import plain
+from advsearch.trust.databases import DAMAGED, check_schema, connect_to_read, readable
 from advsearch.trust.stored_files import parse_json
 from advsearch.trust.writing import check_there, note_open, storage_errors
 
@@ -98,7 +99,7 @@ class Store:
         with readable(path):
             self._db = connect_to_read(path) if read_only else connect_to_write(path)
             check_version(self._db, path)
-            check_schema(self._db, path)
+            check_schema(self._db, path, SCHEMA)
         self._closed: Callable[[], None] | None = None if read_only else note_open(path)
 
     def append(self, rows: Sequence[Row], told: Told | None = None) -> None:
