@@ -130,9 +130,9 @@ FAULTS = (
     ),
     Fault(
         "models: a limit is not applied",
-        "advsearch/models/archive.py",
-        "if unpacked > files.scaled(LARGEST_RATIO) * size + SLACK:",
-        "if unpacked > files.scaled(LARGEST):",
+        "advsearch/trust/archives.py",
+        "if unpacked > scaled(LARGEST_RATIO) * size + SLACK:",
+        "if unpacked > scaled(LARGEST):",
         ("tests/models/test_hostile_models.py",),
     ),
     Fault(

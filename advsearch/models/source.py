@@ -25,11 +25,12 @@ from torch import nn
 from torch.nn.parameter import is_lazy
 
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError, resembling
-from advsearch.models.archive import LARGEST
 from advsearch.models.inputs import takes_image_size
 from advsearch.models.model import CPU, GIVEN_BY, Model, Triple, warn
-from advsearch.models.probe import PROGRAMS, first_line
+from advsearch.models.probe import PROGRAMS
+from advsearch.trust.archives import LARGEST
 from advsearch.trust.code import check_import, current_directory_importable
+from advsearch.trust.foreign_code import first_line
 from advsearch.trust.stored_files import open_regular
 
 

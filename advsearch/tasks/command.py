@@ -14,7 +14,7 @@ from torch import Tensor
 from advsearch.errors import FileFormatError, InputError
 from advsearch.models import Model
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.guards import WithState
+from advsearch.models.inputs import WithState
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Facts, Prediction, Said, Task
 from advsearch.trust import stored_files

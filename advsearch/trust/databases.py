@@ -78,8 +78,8 @@ def protect(db: sqlite3.Connection) -> None:
 
 
 def check_before_writing(path: Path) -> None:
-    """Check that a file that SQLite is to write into is none, or an ordinary one and no link, with a journal of its own.
-    Raises FileFormatError."""
+    """Check that a file that SQLite is to write into is none, or an ordinary one and no link, with a journal of its
+    own. Raises FileFormatError."""
     if os.path.islink(path):
         raise FileFormatError(f"{path}: expected a file of this run, got a link to another; {DAMAGED}")
     if path.exists():

@@ -4,21 +4,27 @@ The threat: an address is stored with the run, shown and shared, and whoever lis
 redirect, would have the key to a model. So the key comes from the environment alone, goes over HTTPS or stays on this
 machine, and follows no redirect; and what is served beyond this machine is served over HTTPS.
 
-Used by models behind addresses (`models/address.py`) and by the server of the dashboard (`viewer/server.py`).
+A library connects to nobody for what only a file names.
+
+Used by models behind addresses (`models/address.py`), libraries (`models/zoo/library.py`) and the server of the
+dashboard (`viewer/server.py`).
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import ipaddress
 import os
 import re
+import socket
 import ssl
 import subprocess
 import tempfile
+import threading
 import urllib.error
 import urllib.request
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import SplitResult, parse_qsl, urlsplit
@@ -108,3 +114,30 @@ def is_address(host: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+@contextlib.contextmanager
+def connecting(allowed: bool, tries: list[object]) -> Iterator[None]:
+    """Let this thread connect to nobody inside the block, unless that is allowed; each try is noted in `tries`."""
+    if allowed:
+        yield
+        return
+    names, thread = ("connect", "connect_ex"), threading.get_ident()
+    before = {name: getattr(socket.socket, name) for name in names}
+
+    def refusing(name: str) -> Callable[[socket.socket, Any], Any]:
+        def connect(self: socket.socket, address: Any) -> Any:
+            if threading.get_ident() != thread:
+                return before[name](self, address)
+            tries.append(address)
+            raise ConnectionRefusedError("only a file names this model")
+
+        return connect
+
+    for name in names:
+        setattr(socket.socket, name, refusing(name))
+    try:
+        yield
+    finally:
+        for name in names:
+            setattr(socket.socket, name, before[name])

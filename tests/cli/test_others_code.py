@@ -247,8 +247,8 @@ def test_what_is_no_name_of_code_is_refused(name: str) -> None:
 def test_processes_that_we_start_look_for_no_modules_in_the_current_folder(module: str) -> None:
     import io
 
-    from advsearch.models.guards import try_torchscript
     from advsearch.scene.mitsuba_backend.llvm import asked_version
+    from advsearch.trust.foreign_code import try_torchscript
 
     Path(f"{module}.py").write_text("open('imported', 'w').close()")
     asked_version("libnone.so")

@@ -4,6 +4,8 @@ torch's reader evaluates expressions and guards as Python, writes names of the g
 modules for containers, and unpickles. So it never sees the file: a new archive is made in memory of its description of
 the network and its weights. What cannot be checked is left out, and all else has to have the form that
 `torch.export.save` gives it; expressions of sizes are arithmetic with whole numbers, symbols and listed functions.
+
+Used by `models/files.py`.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.files import JsonObject, JsonValue
-from advsearch.models.archive import LARGEST_TEXT, Archive, open_archive, refused
+from advsearch.trust.archives import LARGEST_TEXT, Archive, open_archive, refused
 from advsearch.trust.stored_files import parse_json
 
 LENGTH = 20_000  # characters of an expression

@@ -1,17 +1,23 @@
 """Archives of model files, checked before torch, which trusts them, makes anything of them that could run or swell.
 
-Members have distinct, plain names in one folder, are not encrypted, and unpack to no more than a limit. TorchScript is
-rewritten: torch runs a part of its code (`__setstate__`) while it loads, which can call operators that touch files.
+The threat: a model file of somebody else runs code as it is unpickled or loaded, unpacks to more than the memory holds,
+or has members that lead elsewhere. So members have distinct, plain names in one folder, are not encrypted, and unpack
+to no more than a limit; nothing is unpickled. TorchScript is rewritten: torch runs a part of its code (`__setstate__`)
+while it loads, which can call operators that touch files.
+
+Used by `models/files.py` and `models/source.py`; `exported_programs.py` has what archives of `torch.export` need more.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
 import pickle
 import re
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -20,7 +26,7 @@ from typing import Any, BinaryIO
 import torch
 
 from advsearch.errors import FileFormatError
-from advsearch.models.probe import first_line
+from advsearch.trust.foreign_code import first_line
 from advsearch.trust.stored_files import parse_json, scaled, too_large
 
 LARGEST = 16 << 30  # bytes of a model file, and of what it unpacks to
@@ -248,3 +254,17 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
         if not level:
             return
     raise refused(archive.path, f"{name!r} is nested deeper than {DEPTH}")
+
+
+@contextlib.contextmanager
+def without_unpickling() -> Iterator[None]:
+    """Hold `torch.load` to tensors and plain containers, whoever calls it and whatever it asks for."""
+    switches = ("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD")
+    before = {key: os.environ.pop(key) for key in switches if key in os.environ}
+    os.environ[switches[0]] = "1"
+    try:
+        yield
+    finally:
+        for key in switches:
+            os.environ.pop(key, None)
+        os.environ.update(before)
