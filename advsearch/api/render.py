@@ -36,11 +36,10 @@ from advsearch.runs.files import read_png
 from advsearch.runs.results import RenderResult, Result
 from advsearch.runs.summary import read_configuration, read_result
 from advsearch.scene.formation import aovs_of
-from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.hdr import read_exr
 from advsearch.tasks import AnyTask, make_task
 from advsearch.trust.code import allow_named, names_code
-from advsearch.trust.stored_files import read_bytes
+from advsearch.trust.stored_files import LARGEST_FILE, read_bytes
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

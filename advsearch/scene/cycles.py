@@ -28,8 +28,9 @@ from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import glb
 from advsearch.scene.grounds import paved
-from advsearch.scene.importing.blender import command, last_line, surroundings
+from advsearch.scene.importing.blender import command, last_line
 from advsearch.scene.parts import BallLamp, MeshPart, PointLamp
+from advsearch.trust.programs import surroundings
 from advsearch.trust.stored_files import scaled
 
 LONGEST = 300  # seconds that one picture may take, the start included, before `scaled`

@@ -173,3 +173,13 @@ def _check(path: Path, status: os.stat_result, expected: str, limit: int) -> Non
         raise FileFormatError(f"{path}: expected {expected}, got {got}")
     if status.st_size > scaled(limit):
         raise too_large(path, f"{expected} of at most {scaled(limit):,} bytes", f"{status.st_size:,}")
+
+
+LARGEST_FILE = 1 << 29  # bytes that a mesh, a texture or an environment may have, before `scaled`
+
+
+def check_most(path: Path | str, count: int, limit: int, expected: str, got: str | None = None) -> None:
+    """Raise FileFormatError where a file has more of something than a limit, before `scaled`; what was expected has {}
+    in the place of that, and what it got is the count by itself."""
+    if count > (most := scaled(limit)):
+        raise too_large(path, expected.format(f"{most:,}"), f"{count:,}" if got is None else got)

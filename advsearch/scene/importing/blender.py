@@ -17,10 +17,11 @@ import tempfile
 from pathlib import Path
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, read_bytes, run_converter, shown
+from advsearch.scene.importing.files import damaged, looks_like, read_bytes, shown
 from advsearch.trust import stored_files
 from advsearch.trust.code import OWN_FOLDER
-from advsearch.trust.stored_files import scaled
+from advsearch.trust.programs import run_converter, surroundings
+from advsearch.trust.stored_files import LARGEST_FILE, scaled
 
 # ---------------------------------------------------------------------------------------------------------------------
 # OpenUSD files through glTF, which a process of its own makes of them with `usd-core`: readers of binary formats are
@@ -150,12 +151,6 @@ def command(who: str, otherwise: str) -> list[str]:
     if Path(program).name.startswith("python"):
         return [program, "-I"]
     return [program, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1", "--python"]
-
-
-def surroundings(folder: str) -> dict[str, str]:
-    """Return the environment of a process that has a folder for its home, and nothing of ours but the path."""
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
-    return {**kept, "HOME": folder, "TMPDIR": folder}
 
 
 def last_line(said: str) -> str:

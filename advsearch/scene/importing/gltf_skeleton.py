@@ -10,11 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from advsearch.scene.assets import Doubles, Ints
-from advsearch.scene.importing.files import Names, check_most, clean, damaged
+from advsearch.scene.importing.files import Names, clean, damaged
 from advsearch.scene.importing.gltf import GltfFile
 from advsearch.scene.importing.gltf_entries import Animation, Channel, Header, Node, Primitive, Skin
 from advsearch.scene.importing.parts import ImportedPart, put
 from advsearch.scene.skeleton import Clip, Skeleton, Target, Track, entries_of_turn, with_above
+from advsearch.trust.stored_files import check_most
 
 MOST_SETS = 8  # sets of four joints of a vertex
 MOST_KEYS = 1 << 24

@@ -23,7 +23,8 @@ import OpenEXR
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.pictures import LARGEST_PIXELS, check_pixels
 from advsearch.scene.assets import Floats
-from advsearch.scene.importing.files import check_most, damaged, looks_like, shown
+from advsearch.scene.importing.files import damaged, looks_like, shown
+from advsearch.trust.stored_files import check_most
 
 Plane = npt.NDArray[np.floating]
 Planes = tuple[Plane, Plane, Plane]

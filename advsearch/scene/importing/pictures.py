@@ -18,7 +18,9 @@ from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS, LARGEST_PIXELS, check_decodable, check_pixels, opened, steps_of
 from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.files import LARGEST_FILE, Notes, References, check_most, plain_name, shown
+from advsearch.scene.importing.files import Notes, shown
+from advsearch.trust.named_files import References, plain_name
+from advsearch.trust.stored_files import LARGEST_FILE, check_most
 
 TEXTURE_LIMIT = 1024  # longest side of an imported texture, in texels; larger ones are averaged down
 _BAND = 1 << 22  # pixels of a large picture that are averaged at a time

@@ -19,9 +19,10 @@ from pxr import Ar, Sdf
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.importing.blender import LAYERS, PACKAGE
-from advsearch.scene.importing.files import LARGEST_FILE, check_most, shown
+from advsearch.scene.importing.files import shown
 from advsearch.trust import stored_files
-from advsearch.trust.stored_files import scaled
+from advsearch.trust.named_files import is_inside
+from advsearch.trust.stored_files import LARGEST_FILE, check_most, scaled
 
 MOST_LAYERS = 1000
 MOST_ENTRIES = 10_000
@@ -158,7 +159,7 @@ class _LayerCheck:
         is_plain = not any(sign in outer for sign in "`[]:\0") and suffix in (*LAYERS, PACKAGE)
         is_plain = is_plain and (not inner or suffix == PACKAGE)
         target = Path(os.path.realpath(path.parent / outer)) if is_plain else self._folder
-        if not is_plain or not target.is_relative_to(self._folder):
+        if not is_plain or not is_inside(target, self._folder):
             raise FileFormatError(
                 f"{self.file.name}: names the layer {name[:100]!r}, which is no USD file in its folder and is not "
                 "read; put it there, or make one file of all with usdcat --flatten"

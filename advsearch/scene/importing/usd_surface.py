@@ -23,7 +23,6 @@ from pxr import Ar, Usd, UsdShade
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.glb import GlbBuffer, mime_type
-from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.gltf_entries import BORDER, CLAMPED, MIRRORED, REPEAT
 from advsearch.scene.importing.parts import holds_normals
 from advsearch.scene.importing.unread import TrackedKeys, join_names
@@ -36,6 +35,8 @@ from advsearch.scene.importing.usd_pictures import (
     is_of_8_bits,
 )
 from advsearch.trust import stored_files
+from advsearch.trust.named_files import MISSING, OUTSIDE, is_inside
+from advsearch.trust.stored_files import LARGEST_FILE
 
 Array = npt.NDArray[Any]
 FIRST = Usd.TimeCode.EarliestTime()
@@ -236,9 +237,9 @@ class Surfaces:
         resolved = str(asset.resolvedPath) or str(self.folder / path)
         outer, inner = Ar.SplitPackageRelativePathOuter(resolved)
         outer = os.path.realpath(outer)
-        is_inside = Path(outer).is_relative_to(self.folder)
+        is_own = is_inside(outer, self.folder)
         data = None
-        if is_inside and os.path.isfile(outer):
+        if is_own and os.path.isfile(outer):
             try:
                 packaged = Ar.JoinPackageRelativePath(outer, inner) if inner else ""
                 data = (
@@ -249,7 +250,7 @@ class Surfaces:
             except KeyError:
                 data = None
         if data is None:
-            why = "is missing" if is_inside else "is outside its folder and is not read"
+            why = MISSING if is_own else OUTSIDE
             self.leave(f"the texture {path[:100]!r} of {name} {why}")
             return None
         self.read.append(outer)

@@ -21,13 +21,14 @@ import numpy as np
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import References, damaged, looks_like, read_bytes, shown
+from advsearch.scene.importing.files import damaged, looks_like, read_bytes, shown
 from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT, banded_average, read_picture
 from advsearch.scene.library import SUFFIXES as RADIANCE
 from advsearch.scene.library import import_environment, read_light
 from advsearch.scene.mitsuba_backend.meshes import with_inner
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, fewer_warnings, mi
+from advsearch.trust.named_files import References, is_inside
 from advsearch.trust.stored_files import note_opened, scaled, too_large
 
 SUFFIX = ".xml"
@@ -271,7 +272,7 @@ def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin
             raise FileFormatError(f"{path}: {kind} needs {shown(str(name))}, which {reason}") from None
         for candidate in (str(name), os.path.basename(str(name))):
             file = Path(os.path.realpath(os.path.join(path.parent, candidate)))
-            if file.is_file() and file.is_relative_to(os.path.realpath(path.parent)):
+            if file.is_file() and is_inside(file, path.parent):
                 note_opened(file)
                 return file
         raise FileFormatError(f"{path}: {kind} needs {shown(str(name))}; write its name as it is in the folder")
