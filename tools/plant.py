@@ -256,8 +256,8 @@ FAULTS = (
     ),
     Fault(
         "viewer: any name leads to the server",
-        "advsearch/viewer/server.py",
-        "if not self._is_own(host):",
+        "advsearch/trust/pages.py",
+        "if not _is_own(host, named, port, token):",
         "if not host:",
         ("tests/viewer/test_server.py",),
     ),

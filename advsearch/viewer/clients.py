@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from http import HTTPStatus
 from queue import Empty, LifoQueue
 from typing import Any
 
@@ -29,14 +28,6 @@ PATIENCE = 10.0  # seconds in which a client has to have said what it asks for
 SLOWEST = 50_000  # bytes a second at which it has to take the answer at least, beyond as long as `PATIENCE`
 GRACE = 1.0  # seconds that a slow client has where others wait
 TICK = 0.05  # seconds between two looks at the clock
-
-
-class Refused(Exception):
-    """A request that is not answered as asked."""
-
-    def __init__(self, status: HTTPStatus, text: str) -> None:
-        super().__init__(text)
-        self.status = status
 
 
 LARGEST_SENT = 16 << 20  # bytes of what is sent, at most
