@@ -114,6 +114,10 @@ class SceneConfig(Config):
         None, "scene", "which axis of an imported object points up",
         otherwise="as the format says, or else the axis along which it stands best",
     )
+    facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = setting(
+        None, "scene", "which axis of an imported object's file its front faces, turned towards +x here",
+        otherwise="as the format says (+z in glTF and VRM 1, -z in VRM 0), and +x in others",
+    )
     size: float | None = setting(
         None, "scene", "how large the object is: its longest side; distances are then in metres",
         "a number of metres from 1e-4 to 1e4", otherwise="as bundled, or as its file says: glTF is in metres", ge=1e-4,
@@ -296,6 +300,11 @@ class SceneConfig(Config):
         if listed and any("," in str(name) for name in value):
             raise ValueError("a name that would be two; a file can have it")
         return written.as_text(value, several=info.field_name in SEVERAL)
+
+    @field_validator("facing", mode="before", check_fields=False)
+    @classmethod
+    def _with_a_sign(cls, value: Any) -> Any:
+        return f"+{value}" if value in ("x", "y", "z") else value
 
     _things_as_text = field_validator("things", mode="before")(things_as_text)
 

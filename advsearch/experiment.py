@@ -148,7 +148,7 @@ def run_experiment(config: Config, *, progress: Progress | None = None, resumed:
     writes_run = resumed is None and getattr(config, "out", None) is None
     # The folder is made before heavy imports, so that a run that is stopped early can be listed.
     with begun(config) if writes_run else nullcontext(resumed) as folder:
-        experiment = registry.get_experiment(config.command)
+        experiment: Experiment[Result] = registry.get_experiment(config.command)
         return experiment.run(config, progress=progress, resumed=folder)
 
 

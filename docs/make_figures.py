@@ -387,8 +387,8 @@ def reference(record: Record) -> str:
 
 
 def _overall(labels: Sequence[str], figures: Record, heldout: Record) -> list[list[str]]:
-    from advsearch.attacks import clopper_pearson
     from advsearch.models.reference import build
+    from advsearch.statistics.intervals import clopper_pearson
 
     size = sum(parameter.numel() for parameter in build(len(labels)).parameters())
     count, accuracy = heldout["count"], heldout["accuracy"]

@@ -45,6 +45,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "things": (3, "expected a text such as 'car@12,3.5', a mapping or a list of these, got 3"),
     "judge": ("", "expected object, the name of a thing beside it, or all, got ''"),
     "unit": ("ft", "expected mm, cm, m or in, got ft"),
+    "facing": ("ahead", "expected +x, -x, +y, -y, +z or -z, got ahead"),
     "camera": (
         "",
         "expected a name that advsearch import lists, orbit, dashcam, robot, fisheye, equirectangular, or a camera "
@@ -108,8 +109,8 @@ WRONG: dict[str, tuple[Any, str]] = {
 }
 
 GIVEN: dict[str, Any] = {
-    "object": "mug.obj", "environment": "room.hdr", "up": "y", "size": 4.9, "unit": "cm", "camera": "front",
-    "things": "car@1,2", "judge": "car",
+    "object": "mug.obj", "environment": "room.hdr", "up": "y", "facing": "-z", "size": 4.9, "unit": "cm",
+    "camera": "front", "things": "car@1,2", "judge": "car",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
     "labels": "labels.json", "prompt": "a photo of a {}", "ask": {"calls": 5.0}, "task": "detection",

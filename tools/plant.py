@@ -172,7 +172,7 @@ FAULTS = (
     ),
     Fault(
         "attacks: an interval has one side",
-        "advsearch/attacks/trials.py",
+        "advsearch/statistics/intervals.py",
         "tail = (1.0 - confidence) / 2.0",
         "tail = 1.0 - confidence",
         ("tests/attacks/test_attacks_verification.py",),
@@ -215,8 +215,8 @@ FAULTS = (
     Fault(
         "sweeps: a rate of another group",
         "advsearch/questions/sweep/result.py",
-        "answer=counted_by_unit(after, draws),",
-        "answer=counted_by_unit(before, draws),",
+        "answer=counted_by_unit(after, draws, outcome_after),",
+        "answer=counted_by_unit(before, draws, outcome_before),",
         ("tests/engine/test_sweep.py",),
     ),
     Fault(

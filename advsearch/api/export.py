@@ -180,7 +180,7 @@ def real_size(run: str | Path) -> float | None:
 
 
 def _alone(config: AttackConfig) -> Scene:
-    return load_scene(config.object, NO_MAP, up=config.up, size=config.size, unit=config.unit)
+    return load_scene(config.object, NO_MAP, up=config.up, facing=config.facing, size=config.size, unit=config.unit)
 
 
 def printable(run: str | Path, size: float) -> list[Piece]:

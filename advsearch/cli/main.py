@@ -302,13 +302,24 @@ def _parse(words: list[str], command: str | None) -> argparse.Namespace:
     parser, subparsers = without_commands()
     for name in list_commands():
         add_command(subparsers, name, whole=name == command)
-    args, unknown = parser.parse_known_args(words)
+    args, unknown = parser.parse_known_args(_join_negative_axis(words))
     if unknown:
         raise _unknown_argument(unknown[0], subparsers.choices[args.command] if args.command else parser)
     if args.command is None:
         parser.print_help()
         parser.exit()
     return args
+
+
+def _join_negative_axis(words: list[str]) -> list[str]:
+    """Return the words with `--facing -z` as one, as argparse takes `-z` for a flag."""
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1] == "--facing" and word in ("-x", "-y", "-z"):
+            joined[-1] = f"--facing={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAction[Any]]:

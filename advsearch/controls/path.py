@@ -355,11 +355,20 @@ class PathControl(Control):
         return inputs
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        time, start, ways = values["time"], start_of(self.scene, values["time"].device), self._ways(values)
+        unit = "object sizes" if self.scene.object.metres is None else "metres"
+        return {"distance": measure(float(self._distance(self._ways(values), values["time"])), unit)}
+
+    def distances(self, times: Tensor) -> Tensor:
+        """Return the distances (ways, n) of the camera from the object on each of the paths at times (n,), in the unit
+        of `measured`."""
+        return torch.stack([self._distance(ways, times).expand(times.shape) for ways in self._paths])
+
+    def _distance(self, ways: Ways, time: Tensor) -> Tensor:
+        start = start_of(self.scene, time.device)
         shift, _ = self._object(ways, start, time)
         away = self._camera(ways, start, time, shift)[0] - start.middle - shift
-        unit = "object sizes" if self.scene.object.metres is None else "metres"
-        return {"distance": measure(float(away.norm()) * self.scene.metres, unit)}
+        distance: Tensor = away.norm(dim=-1).double() * self.scene.metres
+        return distance
 
     def _ways(self, values: Values) -> Ways:
         return self._paths[int(values[WAY])] if WAY in values else self._paths[0]

@@ -93,7 +93,7 @@ class Shared:
                     turn += 1
 
 
-def worker_call(named: Callable[[ProblemKey], Answerer]) -> Call:
+def worker_call(named: Callable[[Any], Answerer]) -> Call:
     """Return what answers queries that were sent: what a worker does."""
 
     def call(sent: Sequence[Sent]) -> list[Evaluation]:

@@ -37,7 +37,7 @@ def scene_of(config: SceneConfig, name: str | None = None, environment: str | No
 
 
 def told_of_scene(config: SceneConfig) -> dict[str, Any]:
-    names = ("up", "size", "unit", "camera", "things")
+    names = ("up", "facing", "size", "unit", "camera", "things")
     return {**{name: getattr(config, name) for name in names}, "settings": scene_settings(config)}
 
 
@@ -132,7 +132,7 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
     return names
 
 
-OF_SCENE = ("set", "environment", "up", "size", "unit", "camera", "things", "exposure", "object")
+OF_SCENE = ("set", "environment", "up", "facing", "size", "unit", "camera", "things", "exposure", "object")
 
 
 def check_not_of_scene(settings: Mapping[str, object]) -> None:

@@ -13,6 +13,7 @@ import tempfile
 import time
 import weakref
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -195,7 +196,15 @@ class Cycles:
             "bounces": max(0, self._depth - 2),
             "denoise": self._denoise,
         }
-        return message, glb(meshes), radiance
+        return message, glb([_turn_for_blender(mesh) for mesh in meshes]), radiance
+
+
+def _turn_for_blender(shape: Shape) -> Shape:
+    """Return a mesh turned so that Blender, for which the front of a glTF file is -y, has our axes."""
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
+    mesh = shape.mesh
+    turned = replace(mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T)
+    return replace(shape, mesh=turned)
 
 
 def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[Shape]:

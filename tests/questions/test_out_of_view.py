@@ -11,12 +11,12 @@ import pytest
 import small_models
 
 import advsearch
-from advsearch.attacks import clopper_pearson
 from advsearch.errors import InputError
 from advsearch.questions.report.evidence import conditions_of
 from advsearch.questions.sweep.display import distance_of
 from advsearch.questions.sweep.result import Predictions
 from advsearch.runs.summary import read_result
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement, Prediction
 from advsearch.testing import assert_no_worse, assert_suite
 from advsearch.trust.code import allow_code

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import advsearch
-from advsearch.attacks import clopper_pearson, make_policy
+from advsearch.attacks import make_policy
 from advsearch.cli.main import main
 from advsearch.engine.surface_light import refusal_of_surface_light
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
@@ -32,6 +32,7 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SurfaceMap
 from advsearch.runs.files import write_png
 from advsearch.runs.summary import read_result
+from advsearch.statistics.intervals import clopper_pearson
 
 SCENES = Path(__file__).resolve().parents[2] / "advsearch/bundled/data/environments"
 

@@ -239,8 +239,8 @@ def test_a_run_notes_what_is_bundled_and_used_and_nothing_else() -> None:
 
 
 def test_settings_are_listed_as_far_as_they_were_used() -> None:
-    listed = RecordedSettings("", {**AttackConfig(object="car", camera="dashcam", set={"ground.kind": "table"}).plain(),
-                                   "command": "attack"}).as_text()  # fmt: skip
+    config = AttackConfig(object="car", camera="dashcam", set_={"ground.kind": "table"})
+    listed = RecordedSettings("", {**config.plain(), "command": "attack"}).as_text()
     assert (listed["camera"], listed["set"]) == ("dashcam", '{"ground.kind": "table"}') and listed["seed"] == "0"
     assert not {"environment", "run", "overwrite", "minimise", "over", "target"} & listed.keys()
     swept = {**SweepConfig(object="mug").plain(), "command": "sweep"}

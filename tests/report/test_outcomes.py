@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
 import pytest
 from samples import EXPLAIN, HARDEN, SHARE, attack, rated, sweep
 
-from advsearch.attacks.trials import clopper_pearson
 from advsearch.options import OUT_OF_VIEW, Outcome
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.wording import attack_verdict, remarks
@@ -22,6 +21,7 @@ from advsearch.questions.test.result import FAILED, search_verdict, share_reason
 from advsearch.report.shown import shown
 from advsearch.runs.store import Row
 from advsearch.runs.tables import count_wrong_outcomes, sweep_frame
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement, Prediction
 
 COUNTS = {"missed": 2, "loose": 3}
@@ -43,14 +43,15 @@ def test_an_attack_says_that_a_loose_box_is_no_miss() -> None:
     said = attack_verdict(loose)
     assert said.startswith("The model sees this person, but in a loose box in 20 of 20 fresh renders")
     assert "where there is none" not in said
-    both = {"labels": {"person in a loose box": 15, "no person": 5}, "outcomes": {"missed": 5, "loose": 15}}
-    said = attack_verdict(attack(object="person", task="detection", verified=rated(**both)))
+    labels = {"person in a loose box": 15, "no person": 5}
+    verified = rated(labels=labels, outcomes={"missed": 5, "loose": 15})
+    said = attack_verdict(attack(object="person", task="detection", verified=verified))
     assert said.startswith("The model is wrong about this person (5 missed, 15 in a loose box) in 20 of 20 fresh")
 
 
 def test_a_clean_scene_that_fails_says_how() -> None:
     control = {"correct": 3, "trials": 8, "rate": 0.375, "interval": [0.1, 0.8], "outcomes": COUNTS}
-    summary = attack(task="detection", clean={**attack().to_dict()["clean"], "control": control})
+    summary = attack(task="detection", clean={**cast(Any, attack().to_dict()["clean"]), "control": control})
     assert f"The clean scene itself fails 5 of its 8 trials ({SAID})." in remarks(summary)
 
 
@@ -95,7 +96,8 @@ def test_claims_say_how_a_detector_fails() -> None:
     found = attack(task="detection", ending="found", verified=rated(labels={"no cup": 20}, outcomes={"missed": 20}))
     verdict, reason = search_verdict(found, AttackConfig(object="mug"))
     assert verdict == FAILED and reason.endswith(": 20 missed") and "a no cup" not in reason
-    _, reason = tried_reason(0, 8, "no cup", clopper_pearson(0, 8), "8 missed")
+    interval = clopper_pearson(0, 8)
+    reason = tried_reason(FAILED, (0, 8, 0), "no cup", interval, over=False, outcomes="8 missed")
     assert reason.endswith(": 8 missed")
     assert SAID in share_reason("right", FAILED, 7, 12, (0.2, 0.8), "most wrong where it says no cup", SAID)
 

@@ -255,7 +255,8 @@ def test_a_matrix_of_transport_knows_what_stands_beside() -> None:
 def test_light_on_surfaces_refuses_things_by_its_own_rule() -> None:
     def reason(things: str | None) -> str | None:
         scene = advsearch.load_scene("mug", size=0.1, things=things)
-        return why_not(scene.renderer({"camera": {}}, resolution=16, denoise="oidn"), ["camera"])
+        refusal = why_not(scene.renderer({"camera": {}}, resolution=16, denoise="oidn"), ["camera"])
+        return None if refusal is None else refusal.text
 
     assert reason(None) is None
     assert "more in the scene than the object" in str(reason("bowl@0.2,0.1,size=0.15"))

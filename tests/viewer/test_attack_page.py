@@ -29,7 +29,6 @@ from samples import (
     written_page,
 )
 
-from advsearch.attacks import clopper_pearson
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
 from advsearch.questions.attack import wording
@@ -38,6 +37,7 @@ from advsearch.report.shown import NARROW, WIDE, Html, element, join_html, resul
 from advsearch.report.wording import interval_text, objective_label, percent, seconds_text
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.files import read_png
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.viewer.document import asset
 from advsearch.viewer.pages import LARGE_PICTURE, LARGEST, SMALLER_SIDE, object_part, read_object
 

@@ -558,7 +558,7 @@ def test_drawn_parameters_are_shown_in_the_parts_of_the_table(browser: Browser) 
 
 
 def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Path) -> None:
-    from advsearch.attacks import clopper_pearson
+    from advsearch.statistics.intervals import clopper_pearson
 
     code = asset("sweep.js")
     part = code[code.index("  const factorials") : code.index("  function colour")]
@@ -578,7 +578,7 @@ def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Pat
 
 
 def test_intervals_over_drives_are_those_of_the_summary(browser: Browser) -> None:
-    from advsearch.attacks.trials import share_interval
+    from advsearch.statistics.clustered import share_interval
 
     code = asset("sweep.js")
     part, page = code[code.index("  const STAKES") : code.index("  function colour")], browser.new_page()

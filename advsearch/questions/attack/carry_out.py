@@ -420,7 +420,7 @@ def attack(
     parts = [PythonOnly("model", model_name(network)) for network in several(model) if naming.exists_here(network)]
     parts += [PythonOnly("scene")] if scene.only_here else []
     parts += [PythonOnly("task", task.name)] if isinstance(task, Task) and not is_named(task, make_task) else []
-    parts += [PythonOnly("objective", config.objective)] if callable(objective) else []
+    parts += [PythonOnly("objective", own_name)] if callable(objective) else []
     parts += (
         [PythonOnly("policy", policy.name)] if isinstance(policy, Policy) and not is_named(policy, policy_of) else []
     )

@@ -18,7 +18,6 @@ from typing import Any
 import torch
 
 from advsearch import seeds
-from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.cluster import Call, Work
 from advsearch.cluster.dask_pool import executor_of
@@ -43,6 +42,7 @@ from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.runs.summary import read_configuration, read_result
 from advsearch.scene.library import list_objects, load_object
 from advsearch.settings import FILES, Config
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import make_task
 from advsearch.trust.writing import LOCK, PART, storage_errors, write_bytes
 

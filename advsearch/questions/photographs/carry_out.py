@@ -17,7 +17,6 @@ from PIL import Image
 from pydantic import JsonValue
 
 from advsearch import seeds
-from advsearch.attacks import clopper_pearson
 from advsearch.calls import helped
 from advsearch.engine.judging import judgements
 from advsearch.engine.naming import in_turn
@@ -36,6 +35,7 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.settings import read_yaml
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import AnyTask, Judgement, Task, make_task
 from advsearch.tasks.base import Truth
 from advsearch.tasks.together import Together

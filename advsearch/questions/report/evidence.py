@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, cast
 
 from advsearch import __version__, registry
-from advsearch.attacks import clopper_pearson
 from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.questions.attack import wording as attack_wording
@@ -46,6 +45,7 @@ from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.runs.summary import read_result
 from advsearch.scene.description import NO_MAP
 from advsearch.settings import read_yaml
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.trust.stored_files import read_bytes
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -72,7 +72,8 @@ def conditions_of(result: Result, photographs: Sequence[Row] | None = None) -> l
     agree with the rendering that they were aligned with: right in both or wrong in both."""
     conditions = []
     for row in result.axes if isinstance(result, SweepSummary) else ():
-        right, total, interval = row.correct, row.configurations, row.interval
+        right, total = row.correct, row.configurations
+        interval: tuple[float, float] | None = row.interval or (0.0, 1.0)  # none of one draw
         if photographs is not None:
             agree = [
                 bool(photo.correct) == bool(cast(Any, photo.payload)["photo"]["right"])

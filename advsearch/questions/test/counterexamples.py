@@ -19,7 +19,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks.trials import clopper_pearson
 from advsearch.attacks.verification import LEAST_RATE, OVER_CONDITIONS
 from advsearch.config import SceneConfig
 from advsearch.engine.loading import Scene
@@ -37,6 +36,7 @@ from advsearch.runs.files import read_png
 from advsearch.runs.summary import changed_file, file_digests
 from advsearch.settings import FILES, settings
 from advsearch.settings.configuration import PLACE
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement
 from advsearch.trust.stored_files import parse_json, read_text
 from advsearch.trust.writing import write_bytes, write_text
