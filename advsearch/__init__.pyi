@@ -35,7 +35,7 @@ from advsearch.questions.sweep.carry_out import AnyScene
 from advsearch.questions.sweep.result import SweepResult as SweepResult
 from advsearch.questions.sweep.tracks import Step
 from advsearch.questions.test.result import SuiteResult
-from advsearch.registry import allow_code as allow_code
+from advsearch.trust.code import allow_code as allow_code
 from advsearch.tasks import AnyTask
 from advsearch.tasks.base import Task as Task
 from collections.abc import Callable

@@ -19,8 +19,9 @@ from advsearch import registry
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 from advsearch.options import JOINED, by_key, things_as_text
-from advsearch.settings import Clash, Config, power, setting, setting_as_in
+from advsearch.settings import Clash, Config, setting, setting_as_in
 from advsearch.settings import values as written
+from advsearch.trust import powers
 
 FOLDERS = ("references", "state")
 """Options that may be a folder or a file. It is kept by its absolute path, so that a run may go on from anywhere."""
@@ -225,10 +226,10 @@ class SceneConfig(Config):
     deterministic: bool = setting(False, "run", "use one thread, so that a run repeats bit for bit; slower")
     run: str | None = setting(
         None, "run", "where the run is stored", "a name (kept in runs/) or the path of a folder",
-        otherwise="runs/OBJECT-CONTROL-NNN", min_length=1, power=power.place,
+        otherwise="runs/OBJECT-CONTROL-NNN", min_length=1, power=powers.place,
     )
     # fmt: on
-    overwrite: bool = setting(False, "run", "replace a run that is already there", power=power.replacing)
+    overwrite: bool = setting(False, "run", "replace a run that is already there", power=powers.replacing)
 
     @model_validator(mode="after")
     def _one_of_each(self) -> SceneConfig:

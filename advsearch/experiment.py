@@ -25,9 +25,9 @@ from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, watcher
 from advsearch.report.shown import Claim, ShownResult, result_figure, shown
 from advsearch.runs.directory import RunDirectory, begun
-from advsearch.runs.files import write_bytes
 from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.settings import Config
+from advsearch.trust.writing import write_bytes
 from advsearch.viewer.pages import keep_result
 
 Settings = TypeVar("Settings", bound=Config, covariant=True)

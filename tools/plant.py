@@ -87,10 +87,10 @@ FAULTS = (
         ("tests/scene/test_renderer.py", "tests/scene/test_exposure.py"),
     ),
     Fault(
-        "importing: a link is followed outside",
-        "advsearch/scene/importing/files.py",
-        "path = os.path.realpath(os.path.join(self._folder, name))",
-        "path = os.path.normpath(os.path.join(self._folder, name))",
+        "importing: a file outside of the folder is read",
+        "advsearch/trust/named_files.py",
+        "return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))",
+        "return True",
         ("tests/scene/test_importing.py",),
     ),
     Fault(
@@ -130,9 +130,9 @@ FAULTS = (
     ),
     Fault(
         "models: a limit is not applied",
-        "advsearch/models/archive.py",
-        "if unpacked > files.scaled(LARGEST_RATIO) * size + SLACK:",
-        "if unpacked > files.scaled(LARGEST):",
+        "advsearch/trust/archives.py",
+        "if unpacked > scaled(LARGEST_RATIO) * size + SLACK:",
+        "if unpacked > scaled(LARGEST):",
         ("tests/models/test_hostile_models.py",),
     ),
     Fault(
@@ -221,7 +221,7 @@ FAULTS = (
     ),
     Fault(
         "runs: two processes may hold a lock",
-        "advsearch/runs/files.py",
+        "advsearch/trust/writing.py",
         "fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)",
         "fcntl.flock(self._descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)",
         ("tests/engine/test_resume.py", "tests/runs/test_runs.py"),
@@ -256,8 +256,8 @@ FAULTS = (
     ),
     Fault(
         "viewer: any name leads to the server",
-        "advsearch/viewer/server.py",
-        "if not self._is_own(host):",
+        "advsearch/trust/pages.py",
+        "if not _is_own(host, named, port, token):",
         "if not host:",
         ("tests/viewer/test_server.py",),
     ),

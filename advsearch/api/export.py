@@ -34,7 +34,7 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
 from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
-from advsearch.runs.files import placed_by, read_png, storage_errors, to_8bit, write_bytes, write_png, write_text
+from advsearch.runs.files import read_png, to_8bit, write_png
 from advsearch.scene.assembly import ON_PICTURE, posed
 from advsearch.scene.assets import Floats, Ints, Mesh
 from advsearch.scene.color import linear_to_srgb
@@ -43,6 +43,7 @@ from advsearch.scene.glb import PLAIN, glb
 from advsearch.scene.mitsuba_backend.writing import NAME, SCATTERINGS, write_scene
 from advsearch.scene.parts import HazePart
 from advsearch.scene.raster import doubled_areas, rasterised
+from advsearch.trust.writing import placed_by, storage_errors, write_bytes, write_text
 
 GLB, XML = ".glb", ".xml"
 

@@ -18,8 +18,8 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import rounded
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.export import FORMATS, write_rows, write_threedb
-from advsearch.runs.files import placed_by, replacing
 from advsearch.runs.store import NAME, Store
+from advsearch.trust.writing import placed_by, replacing
 from advsearch.viewer.thumbnails import kept_pictures
 
 Written = tuple[dict[str, object], str]  # what to tell of a file, as JSON and in words

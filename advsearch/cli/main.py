@@ -22,14 +22,8 @@ from advsearch.cli import output
 from advsearch.cli.output import BAD_INPUT, INTERRUPTED, OK, at_work, end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, CodeNotAllowedError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
-from advsearch.registry import (
-    EXPERIMENTS,
-    allow_code,
-    get_experiment,
-    get_experiment_help,
-    imported,
-    nothing_allowed,
-)
+from advsearch.registry import EXPERIMENTS, get_experiment, get_experiment_help, imported
+from advsearch.trust.code import allow_code, nothing_allowed
 
 if TYPE_CHECKING:
     from advsearch.experiment import Experiment

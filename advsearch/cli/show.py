@@ -21,12 +21,13 @@ from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
-from advsearch.registry import allow_named, imported
+from advsearch.registry import imported
 from advsearch.report.wording import count, interval_text
 from advsearch.runs.directory import IMAGES, find_run
 from advsearch.runs.listing import Listed, listed_run
 from advsearch.runs.results import plain
 from advsearch.runs.summary import NAME, read_result
+from advsearch.trust.code import allow_named
 
 if TYPE_CHECKING:
     from advsearch.controls import Choice, Parameter

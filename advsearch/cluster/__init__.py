@@ -11,7 +11,7 @@ from queue import SimpleQueue
 from typing import Any, Protocol
 
 from advsearch.files import JsonObject
-from advsearch.registry import allowed_code
+from advsearch.trust.code import allowed_code
 
 Call = Callable[[Sequence[Any]], Any]  # what carries out one batch; a pure function of it
 

@@ -27,8 +27,9 @@ from advsearch import threads  # before torch: it sets how OpenMP waits
 from advsearch.cluster import Call, Work
 from advsearch.errors import AdvsearchError, EnvironmentSetupError, InputError, StorageError
 from advsearch.files import split_paths
-from advsearch.registry import allow_code, imported
+from advsearch.registry import imported
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
+from advsearch.trust.code import allow_code
 
 _CPU_INFO = Path("/proc/cpuinfo")
 PACKAGES = ("mitsuba", "drjit", "torch", "numpy")  # whose versions decide last bits

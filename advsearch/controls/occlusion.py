@@ -23,7 +23,6 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Control, Value, Values, measure, named
 from advsearch.errors import InputError
-from advsearch.files import reading
 from advsearch.scene import library, silhouettes
 from advsearch.scene.assets import Doubles, Material, Mesh, ObjectAsset, normalised
 from advsearch.scene.camera_model import CameraModel
@@ -32,6 +31,7 @@ from advsearch.scene.geometry import affine, camera_to_world, object_to_world, r
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import ORBIT, moving
+from advsearch.trust.stored_files import reading
 
 _moving = partial(moving, ORBIT)
 

@@ -26,7 +26,7 @@ from advsearch.controls.base import Choice, Control, Parameter, Value, Values, m
 from advsearch.controls.pose import euler
 from advsearch.controls.ranges import OneOf, Spec, is_number
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import PATH_ENDINGS, read_text
+from advsearch.files import PATH_ENDINGS
 from advsearch.options import rounded
 from advsearch.scene.assets import Doubles
 from advsearch.scene.description import SceneDescription
@@ -43,6 +43,7 @@ from advsearch.scene.pose_files import (
 )
 from advsearch.scene.settings import GEOMETRIC, ORBIT, ORBIT_CAMERA, moving
 from advsearch.scene.skeleton import entries_of_turn
+from advsearch.trust.stored_files import read_text
 
 APPROACH, PASS, TURN = "approach", "pass", "orbit"
 PATHS = (APPROACH, PASS, TURN)

@@ -20,9 +20,7 @@ from advsearch.calls import helped
 from advsearch.controls import CONTROLS, Control, Space, gathered, make_control, make_space, settings_by_name
 from advsearch.distributions import OwnQuantiles, as_setting
 from advsearch.errors import InputError
-from advsearch.models.guards import plainly
 from advsearch.options import things_as_text, told
-from advsearch.registry import names_code
 from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
@@ -44,6 +42,8 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA, Given
 from advsearch.settings import as_python, read_controls
+from advsearch.trust.code import names_code
+from advsearch.trust.foreign_code import plainly
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
 """One control or several, by name or instance; a mapping gives each name its settings or

@@ -20,13 +20,13 @@ from advsearch.engine.loading import CONTROL, MODEL, Controls, Scene, as_control
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.guards import plainly
 from advsearch.models.loading import named_code
 from advsearch.scene.rig import read_rig
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
 from advsearch.tasks import Task
 from advsearch.tasks.together import Rig, Together, together
+from advsearch.trust.foreign_code import plainly
 
 
 def scene_of(config: SceneConfig, name: str | None = None, environment: str | None = None) -> Scene:

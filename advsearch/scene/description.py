@@ -17,7 +17,6 @@ from typing import Any
 import torch
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.files import reading
 from advsearch.scene import geometry, library, settings
 from advsearch.scene.assets import TRIPOD, Doubles, EnvironmentAsset, Material, ObjectAsset, doubts, sized
 from advsearch.scene.camera_entries import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
@@ -52,6 +51,7 @@ from advsearch.scene.places.quads import FLOOR
 from advsearch.scene.rig import Mount, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.things import ThingPart, with_solids_checked, with_things
+from advsearch.trust.stored_files import reading
 
 DEFAULT_ENVIRONMENT = "studio"
 OBJECT = "object"  # the name of the mesh under test

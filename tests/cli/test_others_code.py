@@ -28,9 +28,9 @@ from advsearch.questions.attack.carry_out import parts_in
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import attacks_of
 from advsearch.questions.photographs.carry_out import Photographs
-from advsearch.registry import allow_named, allowed_code, nothing_allowed
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER
+from advsearch.trust.code import allow_named, allowed_code, nothing_allowed
 
 PLANTED = "open('imported', 'w').close()\nraise RuntimeError('planted')"
 NAME = "planted:make"
@@ -247,8 +247,8 @@ def test_what_is_no_name_of_code_is_refused(name: str) -> None:
 def test_processes_that_we_start_look_for_no_modules_in_the_current_folder(module: str) -> None:
     import io
 
-    from advsearch.models.guards import try_torchscript
     from advsearch.scene.mitsuba_backend.llvm import asked_version
+    from advsearch.trust.foreign_code import try_torchscript
 
     Path(f"{module}.py").write_text("open('imported', 'w').close()")
     asked_version("libnone.so")

@@ -21,11 +21,12 @@ from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.options import Value
 from advsearch.runs import summary
 from advsearch.runs.directory import RunDirectory, find_run
-from advsearch.runs.files import read_png, write_text
+from advsearch.runs.files import read_png
 from advsearch.runs.listing import listed_run
 from advsearch.runs.results import Result
 from advsearch.runs.store import Row, Store, Told
 from advsearch.settings import HEADER
+from advsearch.trust.writing import write_text
 from advsearch.viewer import thumbnails
 
 SUMMARY = attack(ending="interrupted", verified=rated(3)).to_dict()

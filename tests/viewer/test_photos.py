@@ -36,7 +36,8 @@ from advsearch.questions.photographs.result import (
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
 from advsearch.statistics.intervals import clopper_pearson
-from advsearch.viewer.clients import LARGEST_SENT, https_context, reachable
+from advsearch.trust.network import https_context
+from advsearch.viewer.clients import LARGEST_SENT, reachable
 from advsearch.viewer.server import Dashboard
 
 

@@ -23,11 +23,11 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import UNPRINTED
 from advsearch.questions.attack.summary import AttackSummary, DifferentFailures
 from advsearch.report.wording import number_text
-from advsearch.runs.files import write_bytes
 from advsearch.runs.results import LinearTransport, SharedWork, VariedValue
 from advsearch.runs.summary import write_configuration
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import mean
+from advsearch.trust.writing import write_bytes
 from advsearch.viewer.pages import keep_result
 
 T = TypeVar("T")

@@ -9,7 +9,8 @@ from pydantic import JsonValue, model_validator
 
 from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig, name_in, read_named
 from advsearch.files import JsonObject
-from advsearch.settings import Clash, power, setting, setting_as_in, split_names
+from advsearch.settings import Clash, setting, setting_as_in, split_names
+from advsearch.trust import powers
 
 TRIALS, TRIALS_OVER = 20, 200  # Fresh renders that check what a search found, and what holds for many conditions
 STEPS = 40  # Of a search about one picture
@@ -119,7 +120,7 @@ class AttackConfig(DerivativeConfig):
     )
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
         None, "run", "experiment tracker to which every evaluation is sent; its package has to be installed",
-        otherwise="none", power=power.tracker,
+        otherwise="none", power=powers.tracker,
     )
     over: ControlsByName = setting_as_in(
         SceneConfig, "controls", default=dict,
@@ -172,11 +173,11 @@ class AttackConfig(DerivativeConfig):
     workers: int | None = setting(
         None, "run",
         "worker processes; they share the attacks of several objects or models, or the independent renders of one",
-        otherwise="this one alone", unit="processes", ge=1, le=100_000, power=power.many_processes,
+        otherwise="this one alone", unit="processes", ge=1, le=100_000, power=powers.many_processes,
     )
     cluster: str | None = setting(
         None, "run", "where the workers are", "the address of a Dask scheduler, local, or a .yaml file",
-        metavar="PLACE", otherwise="this machine, if there are `workers`", min_length=1, power=power.connection,
+        metavar="PLACE", otherwise="this machine, if there are `workers`", min_length=1, power=powers.connection,
     )
     # fmt: on
 

@@ -36,9 +36,7 @@ from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack import summary as results
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
-from advsearch.runs import files
 from advsearch.runs.directory import CONFIG, PARTS, default_name, is_run
-from advsearch.runs.files import PART, storage_errors, write_bytes
 from advsearch.runs.listing import finished
 from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.runs.summary import read_configuration, read_result
@@ -46,6 +44,7 @@ from advsearch.scene.library import list_objects, load_object
 from advsearch.settings import FILES, Config
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import make_task
+from advsearch.trust.writing import LOCK, PART, storage_errors, write_bytes
 
 
 def carry_out_part(path: Path, config: Config, progress: Progress, ask: Callable[..., Result] | None = None) -> Result:
@@ -119,7 +118,7 @@ def attacks_of(settings: JsonObject) -> Call:
                 path = Path(folder) / part.name
                 config_there = part.config.model_copy(update={"run": str(path), "overwrite": True})
                 ending = attacking.attack_once(config_there, clean=clean).summary.ending
-                kept = (file for file in path.rglob("*") if file.is_file() and file.name != files.NAME)
+                kept = (file for file in path.rglob("*") if file.is_file() and file.name != LOCK)
                 read = {file.relative_to(path).as_posix(): file.read_bytes() for file in kept}
                 carried_out.append((part.name, str(path), read))
                 if ending in SETTLED:

@@ -29,10 +29,10 @@ from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.wording import short_names
 from advsearch.rules import FEWEST_ROWS, find_rules, halves, interval_of, is_shown, observed, share_of
 from advsearch.runs.directory import CONFIG
-from advsearch.runs.files import write_bytes
 from advsearch.runs.summary import read_result
 from advsearch.runs.tables import read_sweep
 from advsearch.statistics.clustered import mean_share, paired_by_unit, per_unit
+from advsearch.trust.writing import write_bytes
 from advsearch.viewer import thumbnails
 
 DRAWS = ("grid", "controls", "samples", "sampler", "seed")  # The settings that decide what is drawn

@@ -15,7 +15,6 @@ from typing import Any, cast
 from advsearch import __version__, registry
 from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
-from advsearch.files import read_bytes
 from advsearch.questions.attack import wording as attack_wording
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.explain.result import ExplainResult, rule_text
@@ -47,6 +46,7 @@ from advsearch.runs.summary import read_result
 from advsearch.scene.description import NO_MAP
 from advsearch.settings import read_yaml
 from advsearch.statistics.intervals import clopper_pearson
+from advsearch.trust.stored_files import read_bytes
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What an engineer reads of a run beside its claims: shares by condition, whether a criterion is met, how common

@@ -34,12 +34,13 @@ from advsearch.questions.sweep.summary import WorstConfiguration, WorstVerified
 from advsearch.questions.sweep.surface import map_surface
 from advsearch.report.wording import count, repeats_remark
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
-from advsearch.runs.files import write_bytes, write_layers
+from advsearch.runs.files import write_layers
 from advsearch.runs.results import INTERRUPTED, DescribedValue, Formation, LinearTransport, SharedWork
 from advsearch.runs.store import Row
 from advsearch.runs.tables import EDGES, NOTE
 from advsearch.statistics.clustered import most_shown
 from advsearch.tasks import Judgement
+from advsearch.trust.writing import write_bytes
 from advsearch.viewer import thumbnails
 
 NOT_FINITE = "pictures not finite"  # the note under which the store keeps that there were some

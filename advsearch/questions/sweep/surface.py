@@ -30,7 +30,6 @@ from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTa
 from advsearch.report.figures import drawn
 from advsearch.report.wording import short_name
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.files import write_bytes
 from advsearch.runs.store import Row
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.description import OBJECT
@@ -39,6 +38,7 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.surface_parts import CELLS, SurfaceParts
 from advsearch.statistics.intervals import wilson
+from advsearch.trust.writing import write_bytes
 
 Counts = npt.NDArray[np.int64]
 Doubles = npt.NDArray[np.float64]

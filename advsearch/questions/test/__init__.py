@@ -34,7 +34,7 @@ def test(context: RunContext[SuiteConfig], suite: Suite | None = None) -> SuiteR
         suite: a YAML file.
     """
     from advsearch.questions.test.carry_out import test_from_config  # imports torch
-    from advsearch.runs.files import write_text
+    from advsearch.trust.writing import write_text
 
     config = context.config
     files = {name: Path(file) for name in FORMATS if (file := getattr(config, name))}

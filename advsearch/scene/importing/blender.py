@@ -16,10 +16,12 @@ import sys
 import tempfile
 from pathlib import Path
 
-from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.registry import OWN_FOLDER
-from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, read_bytes, run_converter, shown
+from advsearch.scene.importing.files import damaged, looks_like, read_bytes, shown
+from advsearch.trust import stored_files
+from advsearch.trust.code import OWN_FOLDER
+from advsearch.trust.programs import run_converter, surroundings
+from advsearch.trust.stored_files import LARGEST_FILE, scaled
 
 # ---------------------------------------------------------------------------------------------------------------------
 # OpenUSD files through glTF, which a process of its own makes of them with `usd-core`: readers of binary formats are
@@ -29,8 +31,8 @@ PACKAGE = ".usdz"
 LAYERS = (".usd", ".usda", ".usdc")
 USD = (*LAYERS, PACKAGE)  # endings of OpenUSD files
 GENERATOR = "advsearch, of OpenUSD"  # what the glTF is made by; what it leaves out is in the extras of its asset
-USD_LONGEST = 120  # seconds that it may take, before `advsearch.files.scaled`
-MEMORY = 8 << 30  # bytes of memory that it may take, before `advsearch.files.scaled`
+USD_LONGEST = 120  # seconds that it may take, before `scaled`
+MEMORY = 8 << 30  # bytes of memory that it may take, before `scaled`
 USD_BEGINNINGS = (b"PXR-USDC", b"#usda", b"PK\x03\x04")
 REFUSED = "refused: "
 _LIMITED = f"""
@@ -64,7 +66,7 @@ def converted(path: Path, data: bytes) -> bytes:
     with tempfile.TemporaryDirectory(prefix="advsearch-usd-") as folder:
         target, inside = Path(folder) / "scene.glb", Path(folder) / "package"
         inside.mkdir()
-        names = [str(files.scaled(MEMORY)), str(path.resolve()), str(target), str(inside)]
+        names = [str(scaled(MEMORY)), str(path.resolve()), str(target), str(inside)]
         program = [sys.executable, "-W", "ignore", "-c", _LIMITED, *names]
         done = run_converter(path, "usd-core", program, folder=OWN_FOLDER, seconds=USD_LONGEST, env=None)
         if done.returncode or not target.is_file():
@@ -76,14 +78,14 @@ def converted(path: Path, data: bytes) -> bytes:
             crashed = f"signal {-done.returncode}" if done.returncode < 0 else shown(last.strip(), quoted=False)
             raise FileFormatError(f"{path}: usd-core could not read it ({crashed}); export or download it again")
         for name in json.loads(done.stdout.splitlines()[-1]):
-            files.note_opened(name)
-        return files.read_bytes(target, "a glTF file", 4 * LARGEST_FILE)
+            stored_files.note_opened(name)
+        return stored_files.read_bytes(target, "a glTF file", 4 * LARGEST_FILE)
 
 
 BLEND = ".blend"
 PROGRAM = "ADVSEARCH_BLENDER"
 """Variable of the environment: a Blender, or a Python that has `bpy`, in the place of those that are looked for."""
-LONGEST = 120  # seconds that Blender may take, before `advsearch.files.scaled`
+LONGEST = 120  # seconds that Blender may take, before `scaled`
 BEGINNINGS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
 """How a .blend file begins: as it is, compressed with zstd, or with gzip (before Blender 3.0)."""
 EXPORT = """
@@ -120,7 +122,7 @@ def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
     with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
         script, target = Path(folder) / "export.py", Path(folder) / "scene.glb"
         script.write_text(EXPORT, "utf-8")
-        names = [str(path.resolve()), str(target), str(files.scaled(LARGEST_FILE))]
+        names = [str(path.resolve()), str(target), str(scaled(LARGEST_FILE))]
         started = [*program, str(script), *([] if "-I" in program else ["--"]), *names]
         try:
             done = run_converter(path, "Blender", started, folder=folder, seconds=LONGEST, env=surroundings(folder))
@@ -149,12 +151,6 @@ def command(who: str, otherwise: str) -> list[str]:
     if Path(program).name.startswith("python"):
         return [program, "-I"]
     return [program, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1", "--python"]
-
-
-def surroundings(folder: str) -> dict[str, str]:
-    """Return the environment of a process that has a folder for its home, and nothing of ours but the path."""
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
-    return {**kept, "HOME": folder, "TMPDIR": folder}
 
 
 def last_line(said: str) -> str:

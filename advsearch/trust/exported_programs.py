@@ -4,6 +4,8 @@ torch's reader evaluates expressions and guards as Python, writes names of the g
 modules for containers, and unpickles. So it never sees the file: a new archive is made in memory of its description of
 the network and its weights. What cannot be checked is left out, and all else has to have the form that
 `torch.export.save` gives it; expressions of sizes are arithmetic with whole numbers, symbols and listed functions.
+
+Used by `models/files.py`.
 """
 
 from __future__ import annotations
@@ -19,9 +21,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from advsearch import files
 from advsearch.files import JsonObject, JsonValue
-from advsearch.models.archive import LARGEST_TEXT, Archive, open_archive, refused
+from advsearch.trust.archives import LARGEST_TEXT, Archive, open_archive, refused
+from advsearch.trust.stored_files import parse_json
 
 LENGTH = 20_000  # characters of an expression
 DEPTH = 60  # of its nesting
@@ -279,12 +281,12 @@ def _operator_problem(text: str) -> str:
 def _tree_problem(text: str) -> str:
     """What a container of inputs or outputs looks like: torch imports the types that it names."""
     try:
-        version, tree = files.parse_json(text)
+        version, tree = parse_json(text)
         nodes: list[Any] = [tree]
         while nodes:
             node = nodes.pop()
             context = "[]" if node["context"] in (None, "null") else node["context"]
-            names: Any = files.parse_json(context) if isinstance(context, str) else None  # of arguments
+            names: Any = parse_json(context) if isinstance(context, str) else None  # of arguments
             plain = isinstance(names, list) and all(isinstance(name, (str, int)) for name in names)
             if node["type"] not in _CONTAINERS or not plain or any(_plain_problem(str(name)) for name in names):
                 return "has inputs or outputs in a container that is no tuple, list or dict"

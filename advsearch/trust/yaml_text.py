@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from advsearch.files import DEPTH, DIGITS, scaled
+from advsearch.trust.stored_files import DEPTH, DIGITS, scaled
 
 LARGEST = 1 << 17  # most bytes of a YAML file
 MOST_VALUES = 100_000  # most values of a YAML text, those that an alias repeats counted again

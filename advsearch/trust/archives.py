@@ -1,17 +1,23 @@
 """Archives of model files, checked before torch, which trusts them, makes anything of them that could run or swell.
 
-Members have distinct, plain names in one folder, are not encrypted, and unpack to no more than a limit. TorchScript is
-rewritten: torch runs a part of its code (`__setstate__`) while it loads, which can call operators that touch files.
+The threat: a model file of somebody else runs code as it is unpickled or loaded, unpacks to more than the memory holds,
+or has members that lead elsewhere. So members have distinct, plain names in one folder, are not encrypted, and unpack
+to no more than a limit; nothing is unpickled. TorchScript is rewritten: torch runs a part of its code (`__setstate__`)
+while it loads, which can call operators that touch files.
+
+Used by `models/files.py` and `models/source.py`; `exported_programs.py` has what archives of `torch.export` need more.
 """
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
 import pickle
 import re
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -19,9 +25,9 @@ from typing import Any, BinaryIO
 
 import torch
 
-from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.models.probe import first_line
+from advsearch.trust.foreign_code import first_line
+from advsearch.trust.stored_files import parse_json, scaled, too_large
 
 LARGEST = 16 << 30  # bytes of a model file, and of what it unpacks to
 LARGEST_TEXT = 64 << 20  # bytes of a member that describes the network: JSON, source code, a pickle of names
@@ -49,8 +55,8 @@ class Archive:
         if name not in self.members:
             raise refused(self.path, f"has no {name!r}, so it is not complete")
         size = self.members[name].file_size
-        if size > files.scaled(limit):
-            raise files.too_large(self.path, f"{name!r} of at most {files.scaled(limit):,} bytes in it", f"{size:,}")
+        if size > scaled(limit):
+            raise too_large(self.path, f"{name!r} of at most {scaled(limit):,} bytes in it", f"{size:,}")
         try:
             return self.zip.read(self.members[name])
         except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, NotImplementedError) as error:
@@ -59,7 +65,7 @@ class Archive:
     def read_json(self, name: str) -> Any:
         """Return the value of a member that is JSON; errors as for `read`, and where it is not JSON."""
         try:
-            return files.parse_json(self.read(name, LARGEST_TEXT))
+            return parse_json(self.read(name, LARGEST_TEXT))
         except ValueError as error:
             raise refused(self.path, f"expected JSON in {name!r}, got {first_line(error)}") from None
 
@@ -73,13 +79,13 @@ def open_archive(path: Path, file: BinaryIO, size: int) -> Archive:
     except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
         raise truncated(path, error) from None
     unpacked, limit = sum(entry.file_size for entry in entries), ""
-    if unpacked > files.scaled(LARGEST):
-        limit, got = f"a model of at most {files.scaled(LARGEST):,} bytes unpacked", f"{unpacked:,}"
-    elif unpacked > files.scaled(LARGEST_RATIO) * size + SLACK:
-        limit = f"a model that unpacks to at most {files.scaled(LARGEST_RATIO)} times its size"
+    if unpacked > scaled(LARGEST):
+        limit, got = f"a model of at most {scaled(LARGEST):,} bytes unpacked", f"{unpacked:,}"
+    elif unpacked > scaled(LARGEST_RATIO) * size + SLACK:
+        limit = f"a model that unpacks to at most {scaled(LARGEST_RATIO)} times its size"
         got = f"{size:,} bytes that unpack to {unpacked:,}"
     if limit:
-        raise files.too_large(path, limit, got)
+        raise too_large(path, limit, got)
     roots = {entry.filename.partition("/")[0] if "/" in entry.filename else "" for entry in entries}
     root = f"{roots.pop()}/" if len(roots) == 1 and "" not in roots else ""
     members = {entry.filename.removeprefix(root): entry for entry in entries}
@@ -248,3 +254,17 @@ def _check_values(archive: Archive, name: str, value: Any) -> None:
         if not level:
             return
     raise refused(archive.path, f"{name!r} is nested deeper than {DEPTH}")
+
+
+@contextlib.contextmanager
+def without_unpickling() -> Iterator[None]:
+    """Hold `torch.load` to tensors and plain containers, whoever calls it and whatever it asks for."""
+    switches = ("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD")
+    before = {key: os.environ.pop(key) for key in switches if key in os.environ}
+    os.environ[switches[0]] = "1"
+    try:
+        yield
+    finally:
+        for key in switches:
+            os.environ.pop(key, None)
+        os.environ.update(before)

@@ -1,7 +1,11 @@
-"""What code of others must not do to us: never end, or leave torch's global switches turned.
+"""What code of others must not do to us: never end, leave torch's global switches turned, or say what it likes.
 
-A call goes on in a thread of its own, left behind when the time is up, for nothing ends torch's loops; what would hold
-Python up too is tried in a process of its own. A network has the type and device for new tensors that its code chose.
+The threat: a network, a file of one or a library that reads it hangs, changes how all later tensors are made, or raises
+any error with any text. A call goes on in a thread of its own, left behind when the time is up, for nothing ends
+torch's loops; what would hold Python up too is tried in a process of its own. A network has the type and device for new
+tensors that its code chose. Of an error of others one short line is shown.
+
+Used by all that loads and calls models (`models/`) and around what the engine does (`engine/`).
 """
 
 from __future__ import annotations
@@ -10,21 +14,22 @@ import io
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any, TypeVar, final
+from typing import Any, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from advsearch import files
-from advsearch.models.model import CPU
-from advsearch.registry import OWN_FOLDER
+from advsearch.errors import AdvsearchError, ModelError
+from advsearch.trust.code import OWN_FOLDER
+from advsearch.trust.stored_files import FACTOR, scaled
 
 LONGEST = 120  # seconds that a file's first passes may take each, and its loading, where that runs a part of it
 GRACE = 5  # seconds for a call to end that was asked to
+_CPU = torch.device("cpu")
 _TRIAL = "import io, sys, torch; torch.jit.load(io.BytesIO(sys.stdin.buffer.read()), map_location='cpu')"
 
 Result = TypeVar("Result")
@@ -35,7 +40,7 @@ class TookTooLong(Exception):
 
     def __init__(self) -> None:
         super().__init__(
-            f"no answer within {files.scaled(LONGEST)} seconds; if you trust it, {files.FACTOR}=10 in the environment "
+            f"no answer within {scaled(LONGEST)} seconds; if you trust it, {FACTOR}=10 in the environment "
             "waits ten times as long"
         )
 
@@ -55,7 +60,7 @@ def within(call: Callable[[], Result], stop: Callable[[], None] | None = None) -
 
     thread = threading.Thread(target=work, daemon=True)  # a daemon's: the process may end before it
     thread.start()
-    thread.join(files.scaled(LONGEST))
+    thread.join(scaled(LONGEST))
     if thread.is_alive():
         if stop is not None:
             stop()
@@ -70,7 +75,11 @@ def try_torchscript(archive: io.BytesIO) -> str:
     command = [sys.executable, "-W", "ignore", "-c", _TRIAL]
     try:
         done = subprocess.run(
-            command, input=archive.getbuffer(), capture_output=True, timeout=files.scaled(LONGEST), cwd=OWN_FOLDER
+            command,
+            input=archive.getbuffer(),
+            capture_output=True,
+            timeout=scaled(LONGEST),
+            cwd=OWN_FOLDER,
         )
     except subprocess.TimeoutExpired:
         return str(TookTooLong())
@@ -83,7 +92,7 @@ class Switches:
     operations that are not deterministic warn (1) or raise (2), and whether NaN in a derivative does."""
 
     dtype: torch.dtype = torch.float32
-    device: torch.device = CPU
+    device: torch.device = _CPU
     gradients: bool = True
     deterministic: int = 0
     anomalies: bool = False
@@ -155,31 +164,21 @@ def called_under(module: nn.Module, switches: Switches) -> None:
     module.register_forward_hook(leave, always_call=True)
 
 
-# ---- A network that takes a state beside pictures, as one of pictures alone -----------------------------------------
+def first_line(error: BaseException) -> str:
+    """Return a foreign error as one short line."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    lines = ["".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line) for line in lines[:1]]
+    text = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+    return text if len(text) <= 300 else text[:297] + "..."
 
-PICTURE = "observation.image"  # what a policy's `select_action` calls the picture
 
-
-@final
-class WithState(nn.Module):
-    """A policy of pictures and a state that stays as it is.
-
-    A policy with a method `select_action` is called as LeRobot's are: with one mapping of the pictures, as `PICTURE`,
-    and of the state (numbers by name), after `reset` where it has one, since what it still holds belongs to an earlier
-    picture. Others are called with the pictures and the mapping, or with the pictures alone where the state is empty.
-    """
-
-    def __init__(self, network: Callable[..., Any], state: Mapping[str, Sequence[float]]) -> None:
-        super().__init__()
-        self.network, self.state = network, dict(state)
-        self.training = False
-
-    def forward(self, images: Tensor) -> Any:
-        """Return what the policy does for pictures (N, ...); it gets each part of the state as (N, numbers)."""
-        state = {name: images.new_tensor(numbers).expand(len(images), -1) for name, numbers in self.state.items()}
-        select = getattr(self.network, "select_action", None)
-        if select is None:
-            return self.network(images, state) if state else self.network(images)
-        getattr(self.network, "reset", lambda: None)()
-        with torch.set_grad_enabled(torch.is_grad_enabled()):
-            return select({PICTURE: images, **state})
+@contextmanager
+def foreign(what: str, kind: type[AdvsearchError] = ModelError) -> Iterator[None]:
+    """Turn what code of others raises inside the block, which may be anything, into an error: what failed, and the
+    foreign error. One of ours is left as it is."""
+    try:
+        yield
+    except AdvsearchError:
+        raise
+    except Exception as error:
+        raise kind(f"{what} ({first_line(error)})") from error

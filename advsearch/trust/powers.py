@@ -1,7 +1,11 @@
 """Settings with power over more than their run: they connect, start many processes, or write and delete elsewhere.
 
-Each is declared with what it does there (`setting(..., power=...)`). That is done because a person has typed it, or
-given it in Python, never because a file says so: run, suite and recipe may be somebody else's.
+The threat: run, suite and recipe may be somebody else's, and a setting in one would do such a thing when it is opened.
+So each setting is declared with what it does there (`setting(..., power=...)`), and that is done because a person has
+typed it, or given it in Python, never because a file says so.
+
+Used by `settings/configuration.py`, which leaves such settings out of what a file says, and by what declares them
+(`config.py`, `questions/`).
 """
 
 from __future__ import annotations
