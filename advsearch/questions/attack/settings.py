@@ -57,9 +57,8 @@ class AttackConfig(DerivativeConfig):
                   & {part for name in map(instance, asked.over) for part in (name, name.rpartition(":")[2])}
               ),
               "names a control that varies by chance, whose derivative nobody asks for; leave it out"),
-        Clash("average", lambda asked: asked.command == "attack" and asked.is_curve,
-              "is not part of a curve; `advsearch gap` compares with the average, or name one `object` and one "
-              "`epsilon`"),
+        Clash("average", lambda asked: asked.epsilons,
+              "is the average within one epsilon; name one `epsilon`, or leave `average` out"),
     )
 
     object: str = setting_as_in(

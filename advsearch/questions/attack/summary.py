@@ -311,9 +311,8 @@ class ObjectRow(Fields):
     margin: JsonFloat | None = optional("mean of the trials, in logits")
     run: str | None = None
     tried: float | None = optional("the largest epsilon that was tried")
-    renders: dict[str, int] | None = optional(
-        "pictures by kind, of the attacks at all epsilons together; null in older runs"
-    )
+    average: AverageCase | None = optional("only with `average`")
+    renders: dict[str, int] | None = optional("pictures by kind, of the attacks at all epsilons together")
 
 
 class CurvePoint(Fields):
