@@ -28,7 +28,9 @@ from advsearch.runs.store import NAME, Row
 
 COMMANDS = {
     "sweep": ["--grid", "pose.yaw=0:360:50", "--grid", "camera.elevation=5:60:16", "--trials", "6"],
-    "attack": ["--control", "camera,pose,light", "--steps", "8", "--average", "20", "--trials", "6", "--verify-spp", "8"],
+    "attack": [
+        *("--control", "camera,pose,light", "--steps", "8", "--average", "20", "--trials", "6", "--verify-spp", "8")
+    ],
 }
 """What is carried out on bundled objects."""
 

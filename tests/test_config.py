@@ -362,7 +362,7 @@ CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
     (AttackConfig, {"average": 10, "epsilon": "0.1,0.2"}, "average: is the average within one epsilon"),
     (RegionConfig, {"spp": 4}, "spp: `advsearch region` has no such setting; leave it out"),
     (RenderConfig, {"out": "a.png", "run": "it"}, "run: `advsearch render` has no such setting; leave it out"),
-    (RegionConfig, {"epsilon": "0.1,0.2"}, "epsilon: several make a curve, which only `advsearch attack` draws"),
+    (CheckConfig, {"epsilon": "0.1,0.2"}, "epsilon: several make a curve, which only `advsearch attack` draws"),
     (SweepConfig, {"sampler": "random", "grid": {"pose.yaw": "0,90"}}, "sampler: is how `controls` are drawn"),
     (SweepConfig, {"fps": 5, "grid": {"pose.yaw": "0,90"}}, "fps: is of a drive; add `path`, or leave `fps` out"),
     (SweepConfig, {"trials": 0, "verify_spp": 8}, "verify_spp: is of the trials, and `trials` is 0"),

@@ -15,7 +15,7 @@ TRIALS, TRIALS_OVER = 20, 200  # Fresh renders that check what a search found, a
 STEPS = 40  # Of a search about one picture
 OVER_PREDICTED, OVER_ONE, OVER_RENDERED, OVER_NUMBERS = (300, 8), (100, 4), (150, 4), (STEPS, 4)
 """Steps, and conditions that each looks at, of a search for many conditions: where a bank of light transport predicts
-pictures (`benchmarks/bank.py`), where that is so and conditions are one number (docs/drives.md), where each is
+pictures, where that is so and conditions are one number (docs/drives.md), where each is
 rendered, and where only a few numbers are searched (a pose)."""
 FEWEST_TRIALS = 6
 """With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
