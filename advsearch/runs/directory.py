@@ -148,7 +148,7 @@ class RunDirectory:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
         now = config.deciding()
         try:
-            before = json.loads(self.store.note(BEGUN_WITH) or "{}")  # older runs note nothing
+            before = json.loads(self.store.note(BEGUN_WITH) or "null")
         except ValueError:
             before = None
         if not isinstance(before, dict):

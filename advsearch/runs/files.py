@@ -212,7 +212,7 @@ DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run 
 LARGEST = 64 << 30
 MAX_SCHEMA_ENTRIES = 100  # of a results.sqlite that are looked at; ours has fewer than ten
 APPLICATION_ID = 0x41445653  # in the header of every results.sqlite that is ours: "ADVS"
-VERSION = 9
+VERSION = 10
 """Of the tables; in the header of the file. Files of another version are read by the advsearch that wrote them."""
 
 SCHEMA = f"""

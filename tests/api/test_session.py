@@ -458,7 +458,7 @@ def test_an_objective_of_ones_own_stands_beside_the_score_of_every_trial(
     assert tried.clean.mean == pytest.approx(sum(control) / 6) and tried.clean.low == min(control)
     assert tried.answer.low <= tried.answer.mean <= tried.answer.high and tried.answer.deviation > 0.0
     assert "loss in the trials: clean 0.4" in objective_text(result.summary)
-    assert objective_text(SUMMARY) == "", "of an older run, and of a margin"
+    assert objective_text(SUMMARY) == "", "of a margin"
 
 
 def test_a_run_that_is_killed_while_it_loads_goes_on(tmp_path: Path) -> None:

@@ -207,7 +207,7 @@ class Printability(Fields):
 
     clean: PrintTerms = Field(description="of the clean scene")
     answer: PrintTerms | None = Field(description="of the adversarial scene; null if nothing was searched")
-    cost: PrintCost | None = optional("what the terms cost in margin; null if nothing was verified, and in older runs")
+    cost: PrintCost | None = optional("what the terms cost in margin; null if nothing was verified")
 
 
 class AmbientPoint(Fields):
