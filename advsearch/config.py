@@ -80,7 +80,7 @@ TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
 """The settings that are texts, whatever they are given as."""
 ControlsByName = dict[str, dict[str, object]]  # controls as they are asked for: their names, each with its settings
 SEARCH_SPP = {"oidn": 8, "none": 16}
-"""Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
+"""Samples a pixel of a search that asks for none, with the denoiser and without."""
 AUTO_SHARE = 2  # with `--spp auto` a search takes the default's samples divided by this
 CLOSE_LOOKS = 4  # then a candidate is rendered so many times more, at most, while it is not clearly worse than the best
 

@@ -30,7 +30,6 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
 from advsearch.questions.compare.result import CompareResult
 from advsearch.questions.explain.result import ExplainResult
-from advsearch.questions.gap import GapResult
 from advsearch.questions.harden.result import HardenResult
 from advsearch.questions.recipe.description import recipe_names as recipe_names
 from advsearch.questions.region.result import RegionResult
@@ -534,7 +533,6 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("results.md", "curve-fields"): result_fields(CurveResult),
     ("results.md", "matrix-fields"): result_fields(MatrixResult),
     ("results.md", "sweep-fields"): result_fields(SweepSummary),
-    ("results.md", "gap-fields"): result_fields(GapResult),
     ("results.md", "region-fields"): result_fields(RegionResult),
     ("results.md", "replay-fields"): result_fields(ReplayResult),
     ("results.md", "explain-fields"): result_fields(ExplainResult),

@@ -35,7 +35,6 @@ from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.questions.attack import stages
 from advsearch.questions.attack.settings import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
-from advsearch.questions.gap import GapResult
 from advsearch.questions.region import growing as mapping
 from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.summary import SweepSummary
@@ -194,7 +193,7 @@ PLAIN = set(
 
 def results() -> Iterator[str]:
     """Fields of results say what they hold; columns and files of a run are in the page about runs."""
-    kinds: list[type[Result]] = [AttackSummary, SweepSummary, GapResult, CurveResult, MatrixResult, RenderResult]
+    kinds: list[type[Result]] = [AttackSummary, SweepSummary, CurveResult, MatrixResult, RenderResult]
     for kind in kinds:
         silent = {name for name, field in kind.described().items() if not script("make_figures")._field(field)}
         if not (kind.__doc__ and kind.command) or silent - PLAIN:

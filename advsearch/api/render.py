@@ -51,9 +51,9 @@ if TYPE_CHECKING:
 def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
     """Return the result of a run from its folder, of the type that the function of its question returns.
 
-    An attack's is an `AttackResult`, a sweep's a `SweepResult`, `gap`'s a `GapResult`, and so on; of several epsilons
-    or models, which only a command attacks, it is the table of them. `search` of a loaded attack is None:
-    `rows("search")` has its steps. Nothing is rendered, and no scene or model is loaded before `render` asks for them.
+    An attack's is an `AttackResult`, a sweep's a `SweepResult`, and so on; of several objects, epsilons or models,
+    which only a command attacks, it is the table of them. `search` of a loaded attack is None: `rows("search")` has its
+    steps. Nothing is rendered, and no scene or model is loaded before `render` asks for them.
 
     Args:
         run: its name, which stands for runs/NAME, or its folder.

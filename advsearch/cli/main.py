@@ -148,7 +148,7 @@ class ExperimentCommand:
 
 GROUPS = {
     "ask: what does a model get wrong?": dict.fromkeys(
-        ("attack", "sweep", "gap", "region", "explain", "compare", "recipe", "harden"), ""
+        ("attack", "sweep", "region", "explain", "compare", "recipe", "harden"), ""
     ),
     "look: at scenes, names and predictions": {
         "render": "",

@@ -155,12 +155,14 @@ class RunDirectory:
     def _check_same(self, config: Config) -> None:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
         now = config.deciding()
+        note = self.store.note(BEGUN_WITH)
         try:
-            before = json.loads(self.store.note(BEGUN_WITH) or "{}")  # older runs note nothing
+            before = json.loads(note or "null")
         except ValueError:
             before = None
         if not isinstance(before, dict):
-            raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got a damaged note")
+            got = "none" if note is None else "a damaged note"
+            raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got {got}")
         changed = [name for name, value in before.items() if name in now and value != now[name]]
         if changed:
             differ = ", ".join(f"{name} was {before[name]!r} and is {now[name]!r}" for name in changed)

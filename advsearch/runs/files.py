@@ -30,7 +30,7 @@ from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import replacing, storage_errors, write_bytes
 
 APPLICATION_ID = 0x41445653  # in the header of every results.sqlite that is ours: "ADVS"
-VERSION = 9
+VERSION = 10
 """Of the tables; in the header of the file. Files of another version are read by the advsearch that wrote them."""
 
 SCHEMA = f"""

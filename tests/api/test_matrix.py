@@ -24,7 +24,7 @@ from advsearch.questions.attack import studies as parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import models_worker
 from advsearch.questions.attack.summary import MatrixResult
-from advsearch.questions.gap import GapConfig
+from advsearch.questions.region.result import RegionConfig
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.tasks import Classification
@@ -142,9 +142,9 @@ def test_what_does_not_go_with_several_models_is_refused(more: dict[str, Any], m
         AttackConfig(**{"object": "mug", "model": "a.pt2,b.pt2", **more})
 
 
-def test_a_gap_has_one_model() -> None:
+def test_a_region_has_one_model() -> None:
     with pytest.raises(InputError, match="model: expected one model, got a,b"):
-        GapConfig(object="mug", model="a,b")
+        RegionConfig(object="mug", model="a,b")
 
 
 @pytest.mark.parametrize(

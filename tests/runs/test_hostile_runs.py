@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from covering import once_each
-from samples import GAP, REGION, SWEEP, attack, rated
+from samples import CURVE, REGION, SWEEP, attack, rated
 
 from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, FileFormatError
@@ -166,7 +166,7 @@ def test_summaries_that_are_none_are_named(text: str, run: Path, capsys: pytest.
 OTHERS = [None, 3, "text", [], [1], {}, {"a": [1]}, True, float("inf"), {"a\u001b[2J": "\u001b"}]
 
 
-@once_each("summary, value", [SUMMARY, SWEEP, GAP, REGION], OTHERS)
+@once_each("summary, value", [SUMMARY, SWEEP, CURVE, REGION], OTHERS)
 def test_summaries_of_other_types_are_named(
     summary: dict[str, Any], value: Any, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -186,7 +186,7 @@ def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> Non
             db.execute(f"PRAGMA user_version = {version}")
             db.execute("UPDATE meta SET value = '2026-11-24T10:00:00Z'")
         db.close()
-        said = rf"expected version 9 of the results, got {version}; read it with .* that wrote it, that of 2026-11-24"
+        said = rf"expected version 10 of the results, got {version}; read it with .* that wrote it, that of 2026-11-24"
         for read_only in (True, False):
             with pytest.raises(FileFormatError, match=said):
                 Store(path, read_only=read_only)

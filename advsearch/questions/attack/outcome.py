@@ -207,7 +207,7 @@ def _searched(problem: Problem, search: SearchResult | None, adversarial: KeptPi
 
 
 def _objective_over(trials: Sequence[Judgement]) -> dict[str, float] | None:
-    """None where it was not asked for, as in trials of an older run."""
+    """Return mean, deviation and range of the objective over trials; None where there are none."""
     values = [trial.objective for trial in trials if trial.objective is not None]
     if not values:
         return None

@@ -16,7 +16,7 @@ TRIALS, TRIALS_OVER = 20, 200  # Fresh renders that check what a search found, a
 STEPS = 40  # Of a search about one picture
 OVER_PREDICTED, OVER_ONE, OVER_RENDERED, OVER_NUMBERS = (300, 8), (100, 4), (150, 4), (STEPS, 4)
 """Steps, and conditions that each looks at, of a search for many conditions: where a bank of light transport predicts
-pictures (`benchmarks/bank.py`), where that is so and conditions are one number (docs/drives.md), where each is
+pictures, where that is so and conditions are one number (docs/drives.md), where each is
 rendered, and where only a few numbers are searched (a pose)."""
 FEWEST_TRIALS = 6
 """With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
@@ -58,9 +58,8 @@ class AttackConfig(DerivativeConfig):
                   & {part for name in map(instance, asked.over) for part in (name, name.rpartition(":")[2])}
               ),
               "names a control that varies by chance, whose derivative nobody asks for; leave it out"),
-        Clash("average", lambda asked: asked.command == "attack" and asked.is_curve,
-              "is not part of a curve; `advsearch gap` compares with the average, or name one `object` and one "
-              "`epsilon`"),
+        Clash("average", lambda asked: asked.epsilons,
+              "is the average within one epsilon; name one `epsilon`, or leave `average` out"),
     )
 
     object: str = setting_as_in(

@@ -188,7 +188,7 @@ def shown(result: ExplainResult) -> ShownResult:
         ResultPart.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
         ResultPart("Where it can be relied on", [envelope_text(result)]),
     ]
-    if result.pairs_sought and result.renders:  # older runs count failures for which nothing could be rendered
+    if result.pairs_sought:
         sections.append(ResultPart("One thing changed", [pairs_text(result)]))
     for pair in result.pairs:
         unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""

@@ -144,9 +144,7 @@ class HardenedControl(Fields):
 
     control: str
     before: Share
-    stronger_before: Share | None = Field(
-        default=None, description="before, against the search `stronger_search`; absent from runs of older versions"
-    )
+    stronger_before: Share = Field(description="before, against the search `stronger_search`")
     after: Share
     stronger: Share = Field(description="after, against the search `stronger_search`")
 
@@ -186,7 +184,8 @@ class HardenResult(InNotebook, RunResult):
     clean_before: Share | None = Field(description="plain renders of held-out scenes that are right")
     clean_after: Share | None
     gained: int | None = Field(
-        default=None, description="held-out scenes that are robust after and were not before; absent of older runs"
+        default=None,
+        description="held-out scenes that are robust after and were not before; null if it was interrupted",
     )
     lost: int | None = Field(default=None, description="held-out scenes that were robust before and are not after")
     p: float | None = Field(

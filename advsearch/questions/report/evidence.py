@@ -288,7 +288,7 @@ def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
     return warnings
 
 
-NOT_NOTED = "not noted: the run is older than that"
+NOT_NOTED = "not noted"
 NO_CLAIM = "The run carries no claim; it is listed so that it is not left out unseen."
 WEIGHTED = "How common the conditions are is what the weights say, of their axes alone."
 NOT_WEIGHTED = "Nothing is said of how common the conditions are: no weights were given."
@@ -298,7 +298,7 @@ def evidence_of(
     name: str, result: Result, claims: Sequence[Claim], recorded: Sequence[RecordedSettings], made: Mapping[str, str]
 ) -> EvidenceRun:
     """Return a run with what a reader needs to judge its claims: the settings that it recorded, its own first, and
-    versions and digests as it noted them (empty of older runs)."""
+    versions and digests as it noted them."""
     settings = recorded[0].values if recorded else {}
     values = {field: getattr(result, field) for field in type(result).model_fields}
     objects = values.get("object") or ", ".join(values.get("objects") or ())

@@ -179,9 +179,7 @@ class TrackRates(Fields):
 
     tracker: str = Field(description="its name")
     lost: OverDrives = Field(description="share of the frames that see the object in which no track is on it")
-    loose: OverDrives | None = results.optional(
-        "likewise, in which none fits it, but a loose one is on it; absent of older runs"
-    )
+    loose: OverDrives = Field(description="likewise, in which none fits it, but a loose one is on it")
     switches: OverDrives = Field(description="how often the track on it has another number than before")
     longest_gap: OverDrives = Field(description="seconds of the longest run of frames without its track")
 

@@ -191,7 +191,7 @@
       };
       for (const name of ["step", "unit", "margin", "probability", "right"]) {
         this.columns[name] = grown(this.columns[name], this.columns[name].constructor);
-        this.columns[name].set(arrays[name] || arrays.step, before); // older files have no unit
+        this.columns[name].set(arrays[name], before);
       }
       this.columns.source = grown(this.columns.source, Uint16Array);
       this.columns.source.fill(source, before);
@@ -205,8 +205,7 @@
       this.columns.answer = grown(this.columns.answer, Uint16Array);
       this.put(this.columns.answer, arrays.answer, this.places(this.answers, head.answers), before);
       this.columns.outcome = grown(this.columns.outcome, Uint16Array);
-      if (arrays.outcome) this.put(this.columns.outcome, arrays.outcome, this.places(this.outcomes, head.outcomes), before);
-      else this.columns.outcome.fill(this.places(this.outcomes, [""])[0], before); // older files have none
+      this.put(this.columns.outcome, arrays.outcome, this.places(this.outcomes, head.outcomes), before);
       head.parameters.forEach((given, number) => {
         const names = given.levels !== null;
         let mine = this.parameters.find((one) => one.name === given.name && (one.levels !== null) === names);
