@@ -112,7 +112,8 @@ class DaskExecutor(WorkerExecutor):
         import dask
         import distributed
 
-        security = distributed.Security(**self._site.security) if self._site.security else None
+        untyped: Any = distributed
+        security = untyped.Security(**self._site.security) if self._site.security else None
         deadline = time.monotonic() + seconds
         dask.config.set(CONFIG)
         logging.getLogger("distributed").setLevel(SILENT)
@@ -124,7 +125,7 @@ class DaskExecutor(WorkerExecutor):
                         self._cluster.scale(self._site.count)
                 left = max(1.0, min(CONNECT, deadline - time.monotonic()))
                 where = self._cluster or self._site.address
-                self._client = distributed.Client(where, security=security, timeout=left, set_as_default=False)
+                self._client = untyped.Client(where, security=security, timeout=left, set_as_default=False)
                 break
             except (OSError, TimeoutError, asyncio.TimeoutError, RuntimeError, ValueError) as error:
                 if time.monotonic() >= deadline:
