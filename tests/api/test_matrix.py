@@ -104,7 +104,7 @@ def test_workers_make_the_pictures_of_the_trials(
     run = tmp_path / "run"
     config = AttackConfig(**{**SHORT, "model": BOTH, "run": str(run)})
     ready = shared(monkeypatch, config.plain(), models_worker)
-    monkeypatch.setattr(parts, "executor_of", lambda work, **_: nullcontext(None))
+    monkeypatch.setattr(parts, "open_workers", lambda work, **_: nullcontext(None))
     result = carried_out(run, workers=2)
     assert isinstance(result, MatrixResult) and len(ready.given) == 3 * 2 * 6
     assert rows(run) == rows(Path(str(whole.run)))

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from advsearch.cluster import Done, Work, Workforce
+from advsearch.cluster import BatchResult, WorkerStats, WorkerTask
 from advsearch.errors import ClusterError
 from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack import studies as parts
@@ -37,24 +37,24 @@ SMALL = AttackConfig(
 class Backwards:
     """Carries out the last range first, in this process; `lost` says of what it dies."""
 
-    facts = Workforce(workers=1)
+    facts = WorkerStats(workers=1)
 
-    def __init__(self, work: Work, lost: str) -> None:
+    def __init__(self, work: WorkerTask, lost: str) -> None:
         self.call, self.lost = parts.attacks_of(work.settings), lost
         assert work.function == "advsearch.questions.attack.studies:attacks_of"
 
-    def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+    def results(self, ranges: Iterable[range]) -> Iterator[BatchResult]:
         for one in reversed(list(ranges)):
-            yield Done(one, None if self.lost else self.call(one), "elsewhere", lost=self.lost)
+            yield BatchResult(one, None if self.lost else self.call(one), "elsewhere", lost=self.lost)
 
 
 def elsewhere(monkeypatch: pytest.MonkeyPatch, lost: str = "") -> None:
     @contextmanager
-    def opened(work: Work, **asked: Any) -> Iterator[Any]:
+    def opened(work: WorkerTask, **asked: Any) -> Iterator[Any]:
         assert (asked["workers"], asked["cluster"]) in ((2, None), (None, None))
         yield None if asked["workers"] is None else Backwards(work, lost)
 
-    monkeypatch.setattr(parts, "executor_of", opened)
+    monkeypatch.setattr(parts, "open_workers", opened)
 
 
 def rows(path: Path) -> list[Any]:

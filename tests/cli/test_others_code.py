@@ -21,8 +21,8 @@ import advsearch
 from advsearch import testing
 from advsearch.cli.dashboard import _LoadedLater as TakenLater
 from advsearch.cli.main import list_commands, main
-from advsearch.cluster import Work
-from advsearch.cluster.worker import Failure, Files, prepare, version
+from advsearch.cluster import WorkerTask
+from advsearch.cluster.worker import run_batch
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import parts_in
 from advsearch.questions.attack.settings import AttackConfig
@@ -173,10 +173,10 @@ def test_what_is_typed_behind_a_file_is_imported(typed: str) -> None:
 
 def in_a_worker() -> None:
     settings = AttackConfig(object="mug", model=NAME, controls={"pose": {}}).plain()
-    work = Work("advsearch.questions.attack.carry_out:attack_worker", settings)
-    failure = prepare("somebody's", work, Files({}, {}), version())
-    assert isinstance(failure, Failure)
-    raise InputError(failure.text)
+    work = WorkerTask("advsearch.questions.attack.carry_out:attack_worker", settings)
+    reply = run_batch(work, [], 60.0)
+    assert reply.failure is not None
+    raise InputError(reply.error)
 
 
 def explained() -> None:

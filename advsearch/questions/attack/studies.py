@@ -19,8 +19,8 @@ import torch
 
 from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cluster import Call, Work
-from advsearch.cluster.dask_pool import executor_of
+from advsearch.cluster import Call, WorkerTask
+from advsearch.cluster.workers import open_workers
 from advsearch.engine.journal import worker_call
 from advsearch.engine.judging import one_label_for_several
 from advsearch.engine.naming import different, load_models
@@ -123,9 +123,9 @@ def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Pr
     left = [number for number, chain in enumerate(chains) if not any(is_run(run / PARTS / part.name) for part in chain)]
     settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
     threads = config.used_threads or 1
-    work = Work("advsearch.questions.attack.studies:attacks_of", settings, FILES, threads, seconds=LONGEST)
+    work = WorkerTask("advsearch.questions.attack.studies:attacks_of", settings, FILES, threads, seconds=LONGEST)
     workers, cluster = (config.workers, config.cluster) if left else (None, None)
-    with executor_of(work, workers=workers, cluster=cluster, tell=progress.message) as executor:
+    with open_workers(work, workers=workers, cluster=cluster, tell=progress.message) as executor:
         if executor is None:
             return
         progress.stage("attacks on workers", len(left))

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.attacks.domain import batches
-from advsearch.cluster import Executor, InProcess
+from advsearch.cluster import InProcess, Workers
 from advsearch.engine.journal import Journal, Sent, Shared, finite, lost, other_numbers, same, worker_call
 from advsearch.engine.loading import framed
 from advsearch.engine.record import LOST, Stages, judgement_of, lost_remarks
@@ -55,9 +55,7 @@ class Sweep:
     """One sweep, from its first configuration or from where it was stopped: `run` has the rows that are there already,
     and None keeps it in memory. Without an executor all is done here."""
 
-    def __init__(
-        self, job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None
-    ) -> None:
+    def __init__(self, job: Job, run: RunDirectory | None, progress: Progress, executor: Workers | None = None) -> None:
         self.job, self.run, self.stages = job, run, Stages(progress)
         self.stages.begin("setup", "preparing the scenes for rendering")
         self.points, self._shown = check_all(job)
