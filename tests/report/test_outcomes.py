@@ -108,7 +108,7 @@ def test_claims_say_how_a_detector_fails() -> None:
     found = attack(task="detection", ending="found", verified=rated(labels={"no cup": 20}, outcomes={"missed": 20}))
     verdict, reason = search_verdict(found, AttackConfig(object="mug"))
     assert verdict == FAILED and reason.endswith(": 20 missed") and "a no cup" not in reason
-    _, reason = tried_reason(FAILED, (0, 8, 0), "no cup", clopper_pearson(0, 8), over=False, outcomes="8 missed")
+    reason = tried_reason(FAILED, (0, 8, 0), "no cup", clopper_pearson(0, 8), over=False, outcomes="8 missed")
     assert reason.endswith(": 8 missed")
     assert SAID in share_reason("right", FAILED, 7, 12, (0.2, 0.8), "most wrong where it says no cup", SAID)
 
