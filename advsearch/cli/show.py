@@ -176,6 +176,8 @@ def _of_choice(choice: Choice) -> dict[str, str]:
     allowed = ", ".join(choice.options)
     if choice.whole:
         allowed = f"{choice.whole[0]} to {choice.whole[1]}"
+    elif choice.most and choice.signed:
+        allowed = f"{-choice.most:g} to {choice.most:g}"
     elif choice.most:
         allowed = f"over 0 to {choice.most:g}"
     default = _cell(choice.default)

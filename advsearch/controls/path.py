@@ -249,7 +249,7 @@ class PathControl(Control):
         if assumed:
             listed = ", ".join(f"{name} {value}" for name, value in assumed.items())
             notes.append(
-                f"{path}: {trajectory.format.value} does not state everything. Assumed: {listed}. If that is wrong, "
+                f"{path}: not everything is stated by {trajectory.format.value}. Assumed: {listed}. If that is wrong, "
                 f"say {', '.join(assumed)} of the control path; with axes none the camera looks at the object."
             )
         quaternions = None

@@ -191,7 +191,7 @@ def overlapping(one: Footprint, other: Footprint) -> bool:
 
 SOLID_NAMES = {
     "houses": "a house", "posts": "a lamp post", "trees": "the trunk of a tree", "sign-post": "the post of a sign",
-    "walls": "a wall", "furniture": "a piece of furniture",
+    "walls": "a wall", "furniture": "a piece of furniture", "lamp": "the ceiling",
 }  # fmt: skip
 """What the solids of a place's meshes are called."""
 

@@ -816,6 +816,12 @@ def test_show_control(capsys: pytest.CaptureFixture[str]) -> None:
     assert "unknown control 'camra'. Did you mean 'camera'?" in capsys.readouterr().err
 
 
+def test_show_says_that_rows_may_be_read_from_the_bottom(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["show", "control", "path"]) == 0
+    (rolling,) = [line for line in capsys.readouterr().out.splitlines() if line.split()[:1] == ["rolling"]]
+    assert "-60 to 60" in rolling
+
+
 def test_show_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
     make_run(tmp_path / "runs" / "first", pictures=False, rows=False)

@@ -11,6 +11,7 @@ import pytest
 from samples import EXPLAIN, HARDEN, SHARE, attack, rated, sweep
 
 from advsearch.options import OUT_OF_VIEW, Outcome
+from advsearch.questions.attack.outcome import name_objective
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.wording import attack_verdict, remarks
 from advsearch.questions.explain.result import ExplainResult
@@ -19,10 +20,13 @@ from advsearch.questions.sweep.page import sweep_verdict
 from advsearch.questions.sweep.result import OUTCOMES, Predictions, SweptAxis
 from advsearch.questions.test.result import FAILED, search_verdict, share_reason, tried_reason
 from advsearch.report.shown import shown
+from advsearch.report.wording import wanted
 from advsearch.runs.store import Row
 from advsearch.runs.tables import count_wrong_outcomes, sweep_frame
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement, Prediction
+from advsearch.tasks.depth import Depth
+from advsearch.tasks.detection import Detection
 
 COUNTS = {"missed": 2, "loose": 3}
 SAID = "2 missed, 3 in a loose box"
@@ -32,6 +36,15 @@ def judged(right: bool, label: str, outcome: Outcome | None) -> Judgement:
     payload: Any = {"box": None, "found": []} | ({} if outcome is None else {"outcome": outcome.value})
     margin = 1.0 if right else -1.0
     return Judgement(-margin, margin, right, Prediction(label), payload)
+
+
+def test_a_goal_in_the_task_is_named_as_one_in_the_objective_is() -> None:
+    """`detection={seek: create}` looks for what the objective `create` looks for, and not for a miss."""
+    created = name_objective(Detection(seek="create"), "score")
+    assert created == "create" == name_objective(Detection(), "create")
+    assert wanted(created, "this mug") == "makes the model see beside this mug what is not there"
+    assert name_objective(Detection(), None) == "score" == name_objective(Depth(), "score")
+    assert name_objective(Depth(seek="nearer"), None) == "nearer"
 
 
 def test_an_attack_says_that_a_loose_box_is_no_miss() -> None:

@@ -142,6 +142,17 @@ def test_a_camera_inside_a_house_is_said_and_how_often_it_is_there() -> None:
     assert re.search(r"inside a house of the place in [3-6][0-9] % of the views", said)
 
 
+@pytest.mark.parametrize(
+    ("distance", "elevation", "solid"), [(8.0, 5.0, "a wall"), (8.0, 40.0, "the ceiling"), (1.0, 40.0, None)]
+)
+def test_a_camera_outside_a_room_is_said(distance: float, elevation: float, solid: str | None) -> None:
+    given = {"ground.kind": "room", "camera.distance": distance, "camera.elevation": elevation}
+    scene = describe("mug", "kitchen", given=given)
+    notes = make_space([make_control("pose")], scene).notes(scene)
+    assert bool(notes) == (solid is not None)
+    assert solid is None or f"The camera is inside {solid} of the place" in notes[-1]
+
+
 def test_outlines_overlap_where_squares_do() -> None:
     def overlap(one: np.ndarray, other: np.ndarray, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bool:
         return overlapping(footprint(one), footprint(other + np.array(shift)))
