@@ -462,7 +462,7 @@ def test_an_interrupted_study_says_how_to_go_on(api: Callable[..., None], capsys
     assert main(["attack", "--object", "mug,bowl"]) == 130
     assert capsys.readouterr().out.endswith(
         f"\n\nNote: Not finished: these are the results so far.\n\n"
-        f"Go on with: advsearch resume {Path(answer.run).name}\n"
+        f"Go on with: advsearch resume {Path(str(answer.run)).name}\n"
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -146,7 +147,11 @@ def test_a_camera_inside_a_house_is_said_and_how_often_it_is_there() -> None:
     ("distance", "elevation", "solid"), [(8.0, 5.0, "a wall"), (8.0, 40.0, "the ceiling"), (1.0, 40.0, None)]
 )
 def test_a_camera_outside_a_room_is_said(distance: float, elevation: float, solid: str | None) -> None:
-    given = {"ground.kind": "room", "camera.distance": distance, "camera.elevation": elevation}
+    given: dict[str, float | str | Sequence[float]] = {
+        "ground.kind": "room",
+        "camera.distance": distance,
+        "camera.elevation": elevation,
+    }
     scene = describe("mug", "kitchen", given=given)
     notes = make_space([make_control("pose")], scene).notes(scene)
     assert bool(notes) == (solid is not None)
