@@ -70,10 +70,10 @@ docs: $(STAMP) ## run what the pages say and build them into build/site; fails o
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # what compares results and not times, and takes long
-STUDIES := searches every_control rotation close_calls closed_form policies precision kill harden kill_cluster detached sequential verdict_flow over_seeds verdicts drives eot
+STUDIES := searches closed_form policies precision kill harden kill_cluster sequential verdict_flow verdicts drives
 
 bench: $(STAMP) ## the benchmarks: ratios against a floor measured in the same run
-	@set -e; for file in $(filter-out $(STUDIES:%=benchmarks/%.py) benchmarks/golden.py benchmarks/matrix.py,$(wildcard benchmarks/[!_]*.py)); do \
+	@set -e; for file in $(filter-out $(STUDIES:%=benchmarks/%.py) benchmarks/golden.py,$(wildcard benchmarks/[!_]*.py)); do \
 	  echo "== $$file"; $(BIN)/python $$file $(ARGS); done
 
 study: $(STAMP) ## the slow studies: policies at equal renders, stated budgets, promised errors, kills (over an hour)

@@ -27,7 +27,7 @@ _HOMES = {
     "Scene": "advsearch.engine.loading",
     "SweepResult": "advsearch.questions.sweep.result",
     "Task": "advsearch.tasks",
-    "allow_code": "advsearch.registry",
+    "allow_code": "advsearch.trust.code",
     "load_model": "advsearch.api.render",
     "load_run": "advsearch.api.render",
     "load_scene": "advsearch.engine.loading",

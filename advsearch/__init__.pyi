@@ -21,7 +21,6 @@ from advsearch.questions.attack.result import AttackResult as AttackResult
 from advsearch.questions.check.result import CheckResult
 from advsearch.questions.compare.result import CompareResult
 from advsearch.questions.explain.result import ExplainResult
-from advsearch.questions.gap import GapResult
 from advsearch.questions.harden.result import HardenResult
 from advsearch.questions.harden.rounds import MakeOptimiser
 from advsearch.questions.harden.training import Examples
@@ -35,9 +34,9 @@ from advsearch.questions.sweep.carry_out import AnyScene
 from advsearch.questions.sweep.result import SweepResult as SweepResult
 from advsearch.questions.sweep.tracks import Step
 from advsearch.questions.test.result import SuiteResult
-from advsearch.registry import allow_code as allow_code
 from advsearch.tasks import AnyTask
 from advsearch.tasks.base import Task as Task
+from advsearch.trust.code import allow_code as allow_code
 from collections.abc import Callable
 from collections.abc import Mapping
 from collections.abc import Sequence
@@ -67,6 +66,7 @@ def attack(
     progress: Watched = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    facing: Literal['+x', '-x', '+y', '-y', '+z', '-z'] | None = ...,
     size: float | None = ...,
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
@@ -121,6 +121,7 @@ def check(
     progress: Watched = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    facing: Literal['+x', '-x', '+y', '-y', '+z', '-z'] | None = ...,
     size: float | None = ...,
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
@@ -162,6 +163,7 @@ def compare(
     object: Path | Names = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    facing: Literal['+x', '-x', '+y', '-y', '+z', '-z'] | None = ...,
     size: float | None = ...,
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
@@ -210,61 +212,6 @@ def explain(
     run: str | Path | None = ...,
     overwrite: bool = ...,
 ) -> ExplainResult: ...
-
-def gap(
-    object: Scene | str | Path,
-    model: AnyModel = ...,
-    *,
-    progress: Watched = ...,
-    environment: Path | Names | None = ...,
-    up: Literal['y', 'z'] | None = ...,
-    size: float | None = ...,
-    unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
-    camera: str | Path | None = ...,
-    set: Mapping[str, float | str | Sequence[float]] | None = ...,
-    things: str | Path | None = ...,
-    judge: str | Path = ...,
-    exposure: float = ...,
-    resolution: int | str | tuple[int, int] | None = ...,
-    labels: Path | Names | None = ...,
-    prompt: Path | Names | None = ...,
-    value_range: str | Sequence[float] | None = ...,
-    ask: Mapping[str, Any] = ...,
-    task: str | Path | Mapping[str, Any] = ...,
-    label: int | np.integer[Any] | Names | None = ...,
-    controls: Controls = ...,
-    texture_resolution: int | None = ...,
-    spp: Union[int, Literal['auto'], None] = ...,
-    denoise: Literal['oidn', 'none'] = ...,
-    pixel_sampler: Literal['independent', 'multijitter'] = ...,
-    seed: int = ...,
-    threads: int | None = ...,
-    deterministic: bool = ...,
-    run: str | Path | None = ...,
-    overwrite: bool = ...,
-    epsilon: float | Mapping[str, Any] | tuple[float, ...] | None = ...,
-    norm: Literal['linf', 'l2'] | None = ...,
-    estimators: str | Mapping[str, str] = ...,
-    objective: str | Path | None = ...,
-    specialise: bool = ...,
-    measure: Literal['no', 'quick', 'full'] = ...,
-    policy: str | Path | Mapping[str, Any] = ...,
-    steps: int | None = ...,
-    seconds: float | None = ...,
-    target: Path | Names | None = ...,
-    minimise: bool = ...,
-    over: Controls = ...,
-    path: str | Path | None = ...,
-    shutter: float | None = ...,
-    rolling: float | None = ...,
-    draws: int | None = ...,
-    average: int = ...,
-    baseline: bool = ...,
-    verify_spp: int | None = ...,
-    trials: int | None = ...,
-    workers: int | None = ...,
-    cluster: str | Path | None = ...,
-) -> GapResult: ...
 
 def harden(
     model: AnyModel = ...,
@@ -325,6 +272,7 @@ def precision(
     progress: Watched = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    facing: Literal['+x', '-x', '+y', '-y', '+z', '-z'] | None = ...,
     size: float | None = ...,
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
@@ -371,6 +319,7 @@ def recipe(
     object: Path | Names | None = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    facing: Literal['+x', '-x', '+y', '-y', '+z', '-z'] | None = ...,
     size: float | None = ...,
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     resolution: int | str | tuple[int, int] | None = ...,
@@ -394,6 +343,7 @@ def region(
     progress: Watched = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    facing: Literal['+x', '-x', '+y', '-y', '+z', '-z'] | None = ...,
     size: float | None = ...,
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,
@@ -462,6 +412,7 @@ def sweep(
     progress: Watched = ...,
     environment: Path | Names | None = ...,
     up: Literal['y', 'z'] | None = ...,
+    facing: Literal['+x', '-x', '+y', '-y', '+z', '-z'] | None = ...,
     size: float | None = ...,
     unit: Literal['mm', 'cm', 'm', 'in'] | None = ...,
     camera: str | Path | None = ...,

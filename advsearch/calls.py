@@ -48,7 +48,7 @@ def unexpected(function: str, given: Mapping[str, object], known: Sequence[str])
 def meant_by(name: str, known: Sequence[str]) -> tuple[list[str], str]:
     """Return the known keywords that the literature calls so, and why there is none like it here."""
     meant = OTHER_TERMS.get(name.lower())
-    return [meant] if meant in known else [], NOWHERE.get(name.lower(), "")
+    return [meant] if meant is not None and meant in known else [], NOWHERE.get(name.lower(), "")
 
 
 def check_types(parameters: Mapping[str, inspect.Parameter], given: Mapping[str, object]) -> None:

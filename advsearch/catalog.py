@@ -50,10 +50,6 @@ BUILT_INS = (
         "render a picture of a scene, and say what the model sees in it",
     ),
     BuiltIn(
-        "experiment", "gap", f"{_EXPERIMENTS}.gap:gap",
-        "compare the worst case with the average over the same space, for each object and each control",
-    ),
-    BuiltIn(
         "experiment", "region", f"{_EXPERIMENTS}.region:region",
         "grow a box around a configuration in which the model's verdict stays the same",
     ),

@@ -19,8 +19,9 @@ from advsearch import registry
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
 from advsearch.options import JOINED, by_key, things_as_text
-from advsearch.settings import Clash, Config, power, setting, setting_as_in
+from advsearch.settings import Clash, Config, setting, setting_as_in
 from advsearch.settings import values as written
+from advsearch.trust import powers
 
 FOLDERS = ("references", "state")
 """Options that may be a folder or a file. It is kept by its absolute path, so that a run may go on from anywhere."""
@@ -79,7 +80,7 @@ TEXTS = (*SEVERAL, "task", "up", "camera", "run", "objective")
 """The settings that are texts, whatever they are given as."""
 ControlsByName = dict[str, dict[str, object]]  # controls as they are asked for: their names, each with its settings
 SEARCH_SPP = {"oidn": 8, "none": 16}
-"""Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
+"""Samples a pixel of a search that asks for none, with the denoiser and without."""
 AUTO_SHARE = 2  # with `--spp auto` a search takes the default's samples divided by this
 CLOSE_LOOKS = 4  # then a candidate is rendered so many times more, at most, while it is not clearly worse than the best
 
@@ -112,6 +113,10 @@ class SceneConfig(Config):
     up: Literal["y", "z"] | None = setting(
         None, "scene", "which axis of an imported object points up",
         otherwise="as the format says, or else the axis along which it stands best",
+    )
+    facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = setting(
+        None, "scene", "which axis of an imported object's file its front faces, turned towards +x here",
+        otherwise="as the format says (+z in glTF and VRM 1, -z in VRM 0), and +x in others",
     )
     size: float | None = setting(
         None, "scene", "how large the object is: its longest side; distances are then in metres",
@@ -221,10 +226,10 @@ class SceneConfig(Config):
     deterministic: bool = setting(False, "run", "use one thread, so that a run repeats bit for bit; slower")
     run: str | None = setting(
         None, "run", "where the run is stored", "a name (kept in runs/) or the path of a folder",
-        otherwise="runs/OBJECT-CONTROL-NNN", min_length=1, power=power.place,
+        otherwise="runs/OBJECT-CONTROL-NNN", min_length=1, power=powers.place,
     )
     # fmt: on
-    overwrite: bool = setting(False, "run", "replace a run that is already there", power=power.replacing)
+    overwrite: bool = setting(False, "run", "replace a run that is already there", power=powers.replacing)
 
     @model_validator(mode="after")
     def _one_of_each(self) -> SceneConfig:
@@ -295,6 +300,11 @@ class SceneConfig(Config):
         if listed and any("," in str(name) for name in value):
             raise ValueError("a name that would be two; a file can have it")
         return written.as_text(value, several=info.field_name in SEVERAL)
+
+    @field_validator("facing", mode="before", check_fields=False)
+    @classmethod
+    def _with_a_sign(cls, value: Any) -> Any:
+        return f"+{value}" if value in ("x", "y", "z") else value
 
     _things_as_text = field_validator("things", mode="before")(things_as_text)
 

@@ -25,9 +25,9 @@ from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, watcher
 from advsearch.report.shown import Claim, ShownResult, result_figure, shown
 from advsearch.runs.directory import RunDirectory, begun
-from advsearch.runs.files import write_bytes
 from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.settings import Config
+from advsearch.trust.writing import write_bytes
 from advsearch.viewer.pages import keep_result
 
 Settings = TypeVar("Settings", bound=Config, covariant=True)
@@ -148,7 +148,7 @@ def run_experiment(config: Config, *, progress: Progress | None = None, resumed:
     writes_run = resumed is None and getattr(config, "out", None) is None
     # The folder is made before heavy imports, so that a run that is stopped early can be listed.
     with begun(config) if writes_run else nullcontext(resumed) as folder:
-        experiment = registry.get_experiment(config.command)
+        experiment: Experiment[Result] = registry.get_experiment(config.command)
         return experiment.run(config, progress=progress, resumed=folder)
 
 

@@ -12,13 +12,14 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageOps
 
-from advsearch import files
 from advsearch.errors import FileFormatError
+from advsearch.trust import stored_files
+from advsearch.trust.stored_files import scaled, too_large
 
 FORMATS = ("BMP", "DDS", "GIF", "JPEG", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
 """Formats of pictures, as Pillow names them. Pillow knows more; for some (EPS) it runs other programs."""
-LARGEST_FILE = 1 << 28  # bytes of a file that `upright` reads, before `advsearch.files.scaled`
-LARGEST_PIXELS = 1 << 26  # of a picture (8192 x 8192), before `advsearch.files.scaled`; decoded they take 4 bytes each
+LARGEST_FILE = 1 << 28  # bytes of a file that `upright` reads, before `scaled`
+LARGEST_PIXELS = 1 << 26  # of a picture (8192 x 8192), before `scaled`; decoded they take 4 bytes each
 MOST_SCANS = 64  # scans of a progressive JPEG, each of which takes as long to decode as a picture; usual are ten
 
 
@@ -34,10 +35,10 @@ def without_pillows_limit() -> Iterator[None]:
 
 def check_pixels(path: Path | str, width: int, height: int, limit: int = LARGEST_PIXELS) -> None:
     """Refuse a picture with too many pixels before it is decoded. Raises FileFormatError where it has more than
-    `limit`, before `advsearch.files.scaled`."""
-    if width * height > files.scaled(limit):
-        expected = f"a picture of at most {files.scaled(limit):,} pixels"
-        raise files.too_large(path, expected, f"{width} x {height}")
+    `limit`, before `scaled`."""
+    if width * height > scaled(limit):
+        expected = f"a picture of at most {scaled(limit):,} pixels"
+        raise too_large(path, expected, f"{width} x {height}")
 
 
 def check_decodable(image: Image.Image, path: Path | str) -> None:
@@ -46,8 +47,8 @@ def check_decodable(image: Image.Image, path: Path | str) -> None:
     check_pixels(path, *image.size)
     if image.format not in (None, "MPO", *FORMATS):  # an MPO is a JPEG with a second picture
         raise FileFormatError(f"{path}: expected a picture such as PNG or JPEG, got {image.format}; convert it")
-    if image.format in ("JPEG", "MPO") and _scans(image) > files.scaled(MOST_SCANS):
-        raise files.too_large(path, f"a JPEG of at most {files.scaled(MOST_SCANS)} scans", f"{_scans(image)}")
+    if image.format in ("JPEG", "MPO") and _scans(image) > scaled(MOST_SCANS):
+        raise too_large(path, f"a JPEG of at most {scaled(MOST_SCANS)} scans", f"{_scans(image)}")
 
 
 @contextlib.contextmanager
@@ -55,7 +56,7 @@ def opened(path: Path, limit: int) -> Iterator[Image.Image]:
     """Open a picture file of at most `limit` bytes for the block, which may decode it. Raises FileFormatError: it is
     missing, no ordinary file, no picture, too large or damaged."""
     try:
-        data = files.read_bytes(path, "a picture file such as PNG", limit)
+        data = stored_files.read_bytes(path, "a picture file such as PNG", limit)
         with warnings.catch_warnings(), without_pillows_limit():
             warnings.simplefilter("ignore")  # of odd metadata
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:

@@ -5,26 +5,20 @@ A package adds to a registry through an entry point of the registry's group, as 
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import os
-import re
-import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property, wraps
+from functools import cached_property
 from importlib import import_module
-from importlib.machinery import PathFinder
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from advsearch.catalog import BuiltIn, list_built_ins
-from advsearch.errors import CodeNotAllowedError, InputError, UnknownNameError
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.trust.code import check_import, current_directory_importable
 
 Entry = TypeVar("Entry")
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 @dataclass(eq=False, repr=False)
@@ -114,123 +108,6 @@ def imported(place: str) -> Any:
     """Return what "module:attribute" names."""
     module, _, attribute = place.partition(":")
     return getattr(import_module(module), attribute)
-
-
-_ALLOWED: set[str] = set()
-"""The Python code, and the models of libraries, that whoever uses this process has named. Of the process, so that it
-holds in every thread; empty at first, so that what only a file names is refused, whoever reads that file."""
-_CODE = re.compile(r"[^\W\d][\w.]*:[^\W\d][\w.]*|(?:hf|timm|torchvision|https?):\S+")
-
-
-def allow_code(*names: str) -> None:
-    """Allow this process to import Python code that a file names, such as the `run.yaml` of a run: read it before.
-
-    Args:
-        names: "package.module:attribute", each as it stands in the file, without weights behind an @; or a model of a
-            library, "hf:OWNER/NAME", whose weights may then be fetched; or a model's address, "https://...", to which
-            pictures may then be sent.
-
-    Raises:
-        InputError: a name is none of this form.
-    """
-    for name in names:
-        if not isinstance(name, str) or not _CODE.fullmatch(name):
-            raise InputError(f"code: expected package.module:attribute, got {str(name)[:80]!r}")
-    _ALLOWED.update(names)
-
-
-def allowed_code() -> tuple[str, ...]:
-    return tuple(sorted(_ALLOWED))
-
-
-def allow_named(settings: Mapping[str, Any]) -> None:
-    """Allow the code that stands in settings which a person has typed or given in Python: as models, controls or
-    metrics, in any form that they may have there. Settings that come from a file are never given to this."""
-    names: list[object] = []
-    for key in ("model", "compared", "than"):
-        texts = [text for text in _listed(settings.get(key)) if isinstance(text, str)]
-        names += [part.partition("@")[0] for text in texts for part in text.split(",")]
-    for key in ("controls", "over"):
-        value = settings.get(key)
-        for control in (*_listed(value), *(value.values() if isinstance(value, Mapping) else ())):
-            names += control.split(",") if isinstance(control, str) else [getattr(control, "kind", None)]
-            names += [control.get("kind")] if isinstance(control, Mapping) else []
-    metrics = settings.get("metrics")
-    for metric in metrics.values() if isinstance(metrics, Mapping) else ():
-        names.append(f"{metric.__module__}:{getattr(metric, '__qualname__', '')}" if callable(metric) else metric)
-    texts = [name.strip() for name in names if isinstance(name, str)]
-    _ALLOWED.update(filter(_CODE.fullmatch, texts))
-
-
-def names_code(function: Function) -> Function:
-    """Let what a caller gives a function, which is for Python only and not for what a file says, allow code too."""
-    signature = inspect.signature(function)
-
-    @wraps(function)
-    def asked(*args: Any, **given: Any) -> Any:
-        with suppress(TypeError):  # of arguments that do not fit, which the function says itself
-            allow_named(signature.bind(*args, **given).arguments)
-        return function(*args, **given)
-
-    return asked  # type: ignore[return-value]
-
-
-def _listed(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, (list, tuple, Mapping)) else [value]
-
-
-@contextmanager
-def nothing_allowed() -> Iterator[None]:
-    """Allow inside the block what is named there alone, and after it what was allowed before."""
-    before = allowed_code()
-    _ALLOWED.clear()
-    try:
-        yield
-    finally:
-        _ALLOWED.clear()
-        _ALLOWED.update(before)
-
-
-def may_fetch(model: str) -> bool:
-    """Return whether a person has named a model of a library, so that its weights may be fetched."""
-    return model in _ALLOWED or model.partition("@")[0] in _ALLOWED
-
-
-def how_to_allow(name: str) -> str:
-    """Return how a person allows what only a file names, for messages."""
-    return f"if you trust it, allow it yourself: in Python with advsearch.allow_code({name!r}), or with `code={name}`"
-
-
-def check_import(name: str) -> None:
-    """Check that "package.module:attribute" may be imported. Raises CodeNotAllowedError where only a file does."""
-    if name in _ALLOWED:
-        return
-    importlib.invalidate_caches()
-    spec = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [*sys.path, os.getcwd()])
-    where = f" from {spec.origin}" if spec is not None and spec.origin else ""
-    raise CodeNotAllowedError(
-        f"a file names {name}, Python code{where} that would be imported and run; read it, and {how_to_allow(name)}"
-    )
-
-
-OWN_FOLDER = Path(__file__).resolve().parents[1]
-"""Where processes of Python that we start begin: Python looks there for modules first, and the folder that a user is in
-may be somebody else's."""
-
-
-@contextmanager
-def current_directory_importable() -> Iterator[None]:
-    """Look for modules in the current directory too, behind the rest of the path, inside the block."""
-    directory = os.getcwd()
-    added = directory not in sys.path and "" not in sys.path
-    if added:
-        sys.path.append(directory)
-        importlib.invalidate_caches()
-    try:
-        yield
-    finally:
-        if added and directory in sys.path:
-            sys.path.remove(directory)
 
 
 def get_class(kind: str, name: str) -> Any:

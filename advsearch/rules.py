@@ -22,10 +22,10 @@ import numpy.typing as npt
 import pandas as pd
 
 from advsearch import seeds
-from advsearch.attacks.trials import fewer_by_chance, per_unit, share_interval
 from advsearch.errors import InputError
 from advsearch.options import OUT_OF_VIEW
 from advsearch.runs.results import ConditionRow
+from advsearch.statistics.clustered import fewer_by_chance, mean_share, per_unit, share_interval
 
 Mask = npt.NDArray[np.bool_]
 FEWEST_ROWS = 100  # rows of which one half can choose and the other can count
@@ -72,14 +72,53 @@ def is_shown(rows: pd.DataFrame) -> Mask:
 
 
 def interval_of(table: pd.DataFrame) -> tuple[float, float]:
-    """Return the 95 % interval of the share of right predictions, over units; 0 to 1 where there is no row."""
+    """Return the 95 % interval of `share_of`; 0 to 1 where there is no row."""
     if table.empty:
         return 0.0, 1.0
     return share_interval(per_unit(table["correct"], table["unit"]), per_unit(np.ones(len(table)), table["unit"]))
 
 
+def share_of(table: pd.DataFrame) -> float:
+    """Return the mean over units of the share of right predictions of each; NaN where there is no row."""
+    return mean_share(per_unit(table["correct"], table["unit"]), per_unit(np.ones(len(table)), table["unit"]))
+
+
+def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table in which units with a configuration in common are one unit: it is the same draw, come twice.
+
+    That is asked only where two draws are never the same by chance: where some factor is a number with at least half as
+    many values as there are rows. Values of a grid, and names, come again in independent draws too.
+    """
+    factors = list(table.attrs["units"])
+    is_continuous = any(table[name].dtype != "category" and 2 * table[name].nunique() >= len(table) for name in factors)
+    if not is_continuous:
+        return table
+    configuration = table.groupby(factors, sort=False, observed=True).ngroup().to_numpy()
+    n_configurations = int(configuration.max()) + 1
+    if n_configurations == len(table):
+        return table
+    merged = table.assign(unit=connected(np.unique(table["unit"], return_inverse=True)[1], configuration))
+    merged.attrs = table.attrs
+    return merged
+
+
+def connected(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return the group (n,) of each row: rows with the same number (n,) from 0 of either kind are in one group."""
+    group = first
+    while True:
+        linked = group
+        for number in (second, first):
+            lowest = np.full(int(number.max()) + 1, len(group))
+            np.minimum.at(lowest, number, linked)
+            linked = lowest[number]
+        if (linked == group).all():
+            return group
+        group = linked
+
+
 def halves(table: pd.DataFrame, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return two halves, drawn by a seed, each of whole units: one to choose on and one to count on."""
+    table = merge_repeats(table)
     units, places = np.unique(table["unit"], return_inverse=True)
     order = np.random.default_rng(seeds.stream(seed, "halves")).permutation(len(units))
     chosen = np.isin(places, order[: len(units) // 2])
@@ -160,10 +199,10 @@ class CountedRule:
 
     @property
     def gap(self) -> float:
-        """By how much more often the model is right elsewhere than under it."""
+        """By how much more often the model is right elsewhere than under it, with equal weight of all units."""
         if self.inside.empty or self.elsewhere.empty:
             return 0.0
-        return float(self.elsewhere["correct"].mean() - self.inside["correct"].mean())
+        return share_of(self.elsewhere) - share_of(self.inside)
 
     @cached_property
     def chance(self) -> float:

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.questions.test.settings import SuiteConfig, suite_of
-from advsearch.registry import allow_named
 from advsearch.settings import PythonOnly
+from advsearch.trust.code import allow_named
 
 if TYPE_CHECKING:
     from advsearch.engine.loading import Scene

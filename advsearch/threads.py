@@ -1,10 +1,10 @@
 """How many threads torch and Dr.Jit use, and how torch's wait, so that the two pools do not fight.
 
-Idle OpenMP threads poll at their barriers, and hold the core that the awaited one needs. Measured
-(`benchmarks/threads.py`), threads that sleep at once are never far from the best; others can be 4 to 6 times slower on
-a busy machine. Right after a render Dr.Jit's workers still poll too, so while there is rendering torch gets half of the
-cores, and all of them only where it works alone (training). OpenMP reads its environment once, when torch is imported:
-this module has to come before torch. What the user has set is left alone. Imports the standard library only.
+Idle OpenMP threads poll at their barriers, and hold the core that the awaited one needs, so they sleep at
+once. Right after a render Dr.Jit's workers still poll too, so while there is rendering torch gets half of the
+cores, and all of them only where it works alone (training). OpenMP reads its environment once, when torch is
+imported: this module has to come before torch. What the user has set is left alone. Imports the standard
+library only.
 """
 
 from __future__ import annotations

@@ -29,7 +29,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -40,7 +39,7 @@ threads.configure()
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from simulated_cluster import Simulated, coordinator  # noqa: E402
+from simulated_cluster import Simulated, SimulatedWorkers  # noqa: E402
 from sweep import ConstantRenderer, resident  # noqa: E402
 
 from advsearch.attacks import Evaluation  # noqa: E402
@@ -149,19 +148,15 @@ def _listed(ratios: Sequence[float]) -> str:
 
 
 class Timed(Simulated):
-    """A simulated pool to whose time that of the coordinator is added."""
+    """Simulated workers to whose time that of the process that gives out and stores is added."""
 
     returned: float | None = None
 
-    def get(self, timeout: float) -> Future[Any]:
+    def advance(self, seconds: float) -> None:
         if self.returned is not None:
             self.now += time.perf_counter() - self.returned
-        now = self.now
-        try:
-            return super().get(timeout)
-        finally:
-            self.now = max(self.now, now)  # what was due meanwhile is late, not in the past
-            self.returned = time.perf_counter()
+        super().advance(seconds)
+        self.returned = time.perf_counter()
 
 
 def swept(workers: int, pictures: int, watch: Any = None) -> tuple[float, float, Simulated]:
@@ -182,7 +177,7 @@ def swept(workers: int, pictures: int, watch: Any = None) -> tuple[float, float,
     pool = Timed(call=seen, seconds=seconds_of, load=0.0, lag=LAG, again=None)
     pool.add(workers)
     with tempfile.TemporaryDirectory() as folder, RunDirectory.create(Path(folder) / "run") as run:
-        sweep = Sweep(job_of(config), run, watch or NullProgress(), coordinator(pool))
+        sweep = Sweep(job_of(config), run, watch or NullProgress(), SimulatedWorkers(pool))
         sweep.carry_out()
         assert run.store.count(KIND) == sweep.total
         return pool.now, sweep.stages.seconds["sweep"], pool

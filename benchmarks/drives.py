@@ -5,8 +5,8 @@
 Drawn without renders, from models of which the truth is known. A drive is right in a share of its frames that it has of
 its own, or changes once, at a random time. Four tables:
 
-- intervals of a mean over drives, and of the share of right frames where drives have unequal numbers of them: how often
-  they have the truth (95 % at least), and how wide they are;
+- intervals of a mean over drives, and of the share of right frames where drives have unequal numbers of them, all of
+  the same weight: how often they have the truth (95 % at least), and how wide they are;
 - two models that are right equally often: how often they are told apart (5 % at most), also where one gains a little in
   most drives and loses much in few;
 - a rule of no effect: how often few right predictions under it are told from chance (1 % at most), and how often one of
@@ -28,9 +28,9 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from advsearch.attacks.trials import fewer_by_chance, mean_interval, paired_by_unit, share_interval
 from advsearch.questions.explain.findings import find_importance
 from advsearch.rules import find_rules, halves
+from advsearch.statistics.clustered import fewer_by_chance, mean_interval, paired_by_unit, share_interval
 
 Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -83,6 +83,16 @@ def intervals(runs: int) -> int:
                 shown = np.arange(FRAMES) < rng.integers(1, FRAMES + 1, (drives, 1))
                 found.append(share_interval((answer(rng, drives, 0.8) & shown).sum(1), shown.sum(1)))
             bad += report(f"frames, {name}", drives, np.array(found), 0.8)
+    for drives in DRIVES:  # nine of ten have the object in one frame and are right, the others in all and are wrong
+        rng = np.random.default_rng(drives)
+        sizes = np.where(rng.random((runs, drives)) < 0.1, FRAMES, 1)
+        ends = np.array([share_interval(np.where(of == 1, 1, 0), of) for of in sizes])
+        bad += report("frames in view in few drives, which are wrong", drives, ends, 0.9)
+    for drives in DRIVES:  # 4 or 60 metres; the range is the plan's, as the far path may not be drawn
+        rng = np.random.default_rng(drives)
+        distances = rng.choice([4.0, 60.0], (runs, drives), p=[0.9, 0.1])
+        ends = np.array([mean_interval(some, 4.0, 60.0) for some in distances])
+        bad += report("distance, one drive of ten far away", drives, ends, 9.6)
     return bad
 
 

@@ -27,11 +27,12 @@ import numpy as np
 import yaml
 from scipy.stats import beta, binom, binomtest, norm
 
-from advsearch.attacks.trials import ConfidenceSequence, mean_interval, share_interval
 from advsearch.cli.main import main as advsearch
 from advsearch.report.wording import interval_text, number_text, percent
 from advsearch.runs.store import Row, Store
 from advsearch.runs.tables import units_of
+from advsearch.statistics.clustered import mean_interval, share_interval
+from advsearch.statistics.sequential import ConfidenceSequence
 
 Interval = tuple[float, float]
 RUNS = ("weather", "rules", "drive", "paint", "beside", "clean-and-paint", "gate")

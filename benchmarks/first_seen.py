@@ -1,4 +1,4 @@
-"""How far away a detector first sees a car, from a dashcam that comes nearer: by day, in the wet, at dusk, by night.
+"""How far away a detector first sees a car, from a dashcam that follows it: by day, in the wet, at dusk, by night.
 
     python benchmarks/first_seen.py detector.pt2 [--labels coco90] [--label car] [--draws 8] [--distances 10,16,22]
 
@@ -33,8 +33,9 @@ from torch.nn.functional import max_pool2d
 
 import advsearch
 from advsearch.options import Outcome
-from advsearch.questions.sweep.display import distance_of, distance_sentence, find_dips
+from advsearch.questions.sweep.display import distance_of, distance_sentence
 from advsearch.questions.sweep.summary import AxisRow
+from advsearch.statistics.monotone import find_dips
 
 SECONDS_MOST, F_NUMBER, READ = 1.0 / 30.0, 2.0, 3.0
 """Of the camera: the longest exposure, the lens, and electrons of noise in the dark."""
@@ -48,7 +49,8 @@ JITTER: dict[str, Any] = {
         "shift_y": [-0.03, 0.03],
     }
 }
-"""What differs between draws. Nothing but the camera moves, so that no scene is built anew."""
+"""What differs between draws; azimuth 0 is behind the car. Nothing but the camera moves, so that no scene is built
+anew."""
 
 
 class Light(NamedTuple):

@@ -99,7 +99,7 @@ def commands() -> dict[str, list[list[str]]]:
         "target": ["attack", "--control", texture, "--target", "bowl", *few],
         "minimise": ["attack", "--control", "pose", "--minimise", *few],
         "smallest": ["attack", "--control", texture, "--smallest", *few],
-        "gap": ["gap", "--control", "pose,camera", "--average", "4", *few],
+        "study": ["attack", "--object", "mug,bowl", "--control", "pose", "--average", "4", *few],
         "region": ["region", "--control", "pose", "--samples", "8"],
     }
     return {name: [command] for name, command in single.items()} | found | predictions() | worlds() | questions()

@@ -2,9 +2,10 @@
 
     python benchmarks/kill_cluster.py [--kills 100] [--seconds 3600] [--resolution 32]
 
-A scheduler and two workers are started by Dask's own command line, and again when they were killed; a sweep and a `gap`
-take turns, and one that was killed is resumed. Every row of each must agree in every column but times, and be there
-once. After so many seconds nothing more is killed. The exit status is 3 if rows differ, or a run does not end.
+A scheduler and two workers are started by Dask's own command line, and again when they were killed; a sweep and an
+attack on three objects take turns, and one that was killed is resumed. Every row of each must agree in every column but
+times, and be there once. After so many seconds nothing more is killed. The exit status is 3 if rows differ, or a run
+does not end.
 """
 
 from __future__ import annotations
@@ -27,11 +28,13 @@ from advsearch.runs.store import NAME, Row
 
 COMMANDS = {
     "sweep": ["--grid", "pose.yaw=0:360:50", "--grid", "camera.elevation=5:60:16", "--trials", "6"],
-    "gap": ["--control", "camera,pose,light", "--steps", "8", "--average", "20", "--trials", "6", "--verify-spp", "8"],
+    "attack": [
+        *("--control", "camera,pose,light", "--steps", "8", "--average", "20", "--trials", "6", "--verify-spp", "8")
+    ],
 }
 """What is carried out on bundled objects."""
 
-OBJECTS = {"sweep": "mug", "gap": "mug,bowl,teapot"}
+OBJECTS = {"sweep": "mug", "attack": "mug,bowl,teapot"}
 
 VICTIMS = ("worker", "scheduler", "coordinator", "workers")
 """Who is killed in turn; the last are all workers at once."""

@@ -20,7 +20,7 @@ import sys
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.attacks.trials import STAKES
+from advsearch.statistics.sequential import STAKES
 
 Floats = npt.NDArray[np.float64]
 

@@ -30,7 +30,6 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
 from advsearch.questions.compare.result import CompareResult
 from advsearch.questions.explain.result import ExplainResult
-from advsearch.questions.gap import GapResult
 from advsearch.questions.harden.result import HardenResult
 from advsearch.questions.recipe.description import recipe_names as recipe_names
 from advsearch.questions.region.result import RegionResult
@@ -141,7 +140,21 @@ def own_flags(command: str) -> Callable[[Record], str]:
         left_out = [f"`{one.flag}`" for one in as_in_attack if one.flag not in flags_of(command)]
         few = len(left_out) < 4
         said = f"All flags of `attack` but {', '.join(left_out)}" if few else f"As for `attack`: {', '.join(shared)}"
-        own = [_flag_row(one) for one in known if one not in as_in_attack]
+        rows_of_attack = {one.flag: _flag_row(one) for one in as_in_attack}
+        own, other_defaults = [], []
+        for one in known:
+            if one in as_in_attack:
+                continue
+            row = _flag_row(one)
+            same = None if one.group in (command, "verification") else rows_of_attack.get(one.flag)
+            if same is not None and same[:3] == row[:3] and row[3]:
+                other_defaults.append(f"{row[0]} ({row[3]})")
+                continue
+            if same is not None and row[2] and same[2] == row[2]:
+                row[2] = "as for `attack`"
+            own.append(row)
+        if other_defaults:
+            said += f". With another default: {', '.join(other_defaults)}"
         return _wrapped(f"{said}.") + ("\n" + table(FLAG_HEADS, own) if own else "")
 
     return make
@@ -333,11 +346,8 @@ def _field(field: FieldInfo | ComputedFieldInfo) -> str:
 
 
 def _inside(kind: type[Fields]) -> str:
-    """The fields of what is in a field."""
-    return ", ".join(
-        f"`{part.alias or name}`" + (f" ({part.description})" if part.description else "")
-        for name, part in kind.model_fields.items()
-    )
+    """The names of the fields of what is in a field; their descriptions are in the JSON schema."""
+    return ", ".join(f"`{part.alias or name}`" for name, part in kind.model_fields.items())
 
 
 def _first_sentence(kind: type[Fields]) -> str:
@@ -385,8 +395,8 @@ def reference(record: Record) -> str:
 
 
 def _overall(labels: Sequence[str], figures: Record, heldout: Record) -> list[list[str]]:
-    from advsearch.attacks import clopper_pearson
     from advsearch.models.reference import build
+    from advsearch.statistics.intervals import clopper_pearson
 
     size = sum(parameter.numel() for parameter in build(len(labels)).parameters())
     count, accuracy = heldout["count"], heldout["accuracy"]
@@ -424,17 +434,18 @@ RECIPES = "images/recipes/results.json"
 
 
 def recipe_results(record: Record) -> str:
-    """What `docs/make_recipe_images.py` kept of each recipe, on bundled objects and on other data."""
+    """What `docs/make_recipe_images.py` kept of each recipe: on other data, or else on bundled objects."""
     path = DOCS / RECIPES
     kept = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     return "\n".join(_recipe(name, kept.get(name, {})) for name in sorted({*kept, *recipe_names()}))
 
 
 def _recipe(name: str, found: Mapping[str, Any]) -> str:
-    text = f"### {name}\n"
-    for kind, how in (("bundled", "With `--quick`"), ("data", "On real data")):
-        text += "\n" + (_recipe_on(found[kind], how) if kind in found else f"**{how}**: not run yet.\n")
-    return text
+    text = f"### {name}\n\n"
+    for kind, how in (("data", "On real data"), ("bundled", "With `--quick`")):
+        if kind in found:
+            return text + _recipe_on(found[kind], how)
+    return text + "Not run yet.\n"
 
 
 def _recipe_on(told: Mapping[str, Any], how: str) -> str:
@@ -446,7 +457,7 @@ def _recipe_on(told: Mapping[str, Any], how: str) -> str:
     text = _wrapped(f"**{how}**: {what} in {places}, seen by {models}; {told['renders']} renders{took}.") + "\n"
     for figure in told["figures"]:
         text += f"![{figure['title']}](images/recipes/{figure['image']})\n\n"
-        text += _wrapped(f"*{figure['title']}.* " + " ".join(figure["text"])) + "\n"
+        text += _wrapped(f"*{figure['title']}.* " + figure["text"][0]) + "\n"
     return text
 
 
@@ -524,7 +535,6 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("results.md", "curve-fields"): result_fields(CurveResult),
     ("results.md", "matrix-fields"): result_fields(MatrixResult),
     ("results.md", "sweep-fields"): result_fields(SweepSummary),
-    ("results.md", "gap-fields"): result_fields(GapResult),
     ("results.md", "region-fields"): result_fields(RegionResult),
     ("results.md", "replay-fields"): result_fields(ReplayResult),
     ("results.md", "explain-fields"): result_fields(ExplainResult),

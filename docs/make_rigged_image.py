@@ -79,7 +79,7 @@ def write_lamp(path: Path) -> None:
     samplers = []
     for joint in range(3):
         turn = np.zeros((3, 4), np.float32)
-        turn[:, 2], turn[:, 3] = -np.sin(half[joint]), np.cos(half[joint])
+        turn[:, 0], turn[:, 3] = np.sin(half[joint]), np.cos(half[joint])  # towards +z, the front
         output = made.accessor(turn, "VEC4")
         samplers.append({"input": made.accessor(times, "SCALAR", bounds=False), "output": output})
     colors = ([0.05, 0.05, 0.06, 1.0], [0.5, 0.5, 0.52, 1.0], [0.55, 0.08, 0.05, 1.0])

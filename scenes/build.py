@@ -53,6 +53,8 @@ def object_files(family: ObjectFamily) -> dict[str, bytes]:
         "triangles": len(asset.mesh.faces),
         "metres": asset.metres,
     }
+    if asset.drives:
+        facts["drives"] = True
     if asset.finishes:
         facts["finishes"] = {name: asdict(one) for name, one in asset.finishes.items()}
         facts["faces"] = _runs(asset.mesh)

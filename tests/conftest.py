@@ -35,7 +35,7 @@ QUICK, QUICKEST = 0.15, 5.0
 def own_models() -> None:
     """Allow the small models of the tests, which configurations of theirs name as files do. A command allows nothing
     but what it names."""
-    from advsearch.registry import allow_code
+    from advsearch.trust.code import allow_code
 
     allow_code(*(f"small_models:{name}" for name in ("easy", "hard", "near", "strange", "Colours")))
 

@@ -10,7 +10,6 @@ import OpenEXR
 
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult, attack_of
-from advsearch.questions.gap import GapResult
 from advsearch.questions.region.result import RegionResult
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.runs.directory import RunDirectory
@@ -91,13 +90,6 @@ CURVE: dict[str, Any] = {
         {"epsilon": 0.01, "objects": 4, "robust": 3, "found": 0, "already_wrong": 1, **ACCURACY},
         {"epsilon": 0.1, "objects": 0, "robust": 0, "found": 0, "already_wrong": 0, "accuracy": None,
          "interval": [0.0, 1.0]},
-    ],
-}  # fmt: skip
-GAP: dict[str, Any] = {
-    **STUDY, "command": "gap", "run": "runs/mug-pose-001", "objects": ["mug"], "controls": ["pose"],
-    "table": [
-        {"object": "mug", "control": "pose", "average": {**AVERAGE, **ACCURACY}, "worst": rated(), "ending": "found",
-         "margin": 3.25, "renders": {"search": 40}, "run": None},
     ],
 }  # fmt: skip
 MATRIX: dict[str, Any] = {
@@ -192,11 +184,6 @@ def sweep(**changes: Any) -> SweepSummary:
 def curve(**changes: Any) -> CurveResult:
     """Return a curve's result with other fields."""
     return CurveResult.of({**CURVE, **changes})
-
-
-def gap(**changes: Any) -> GapResult:
-    """Return a gap's result with other fields."""
-    return GapResult.of({**GAP, **changes})
 
 
 def matrix(**changes: Any) -> MatrixResult:

@@ -1,177 +1,173 @@
-"""A pool of workers that are only simulated, with a clock of its own: it runs as fast as the coordinator can."""
+"""Workers that are only simulated, with a clock of their own: they run as fast as whoever gives them work."""
 
 from __future__ import annotations
 
 import heapq
 import queue
 from collections import deque
-from collections.abc import Callable, Collection
-from concurrent.futures import Future
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import BrokenExecutor, Future, InvalidStateError
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from advsearch.cluster import SchedulerGoneError, Work
-from advsearch.cluster.coordinator import Coordinator
-from advsearch.cluster.worker import Carried, Failure, Files, Ready, prepare
-from advsearch.errors import ClusterError
-
-HERE = {"processor": "here"}
+from advsearch.cluster import DEATHS, WorkerDiedError, WorkerExecutor, WorkerStats, WorkerTask
+from advsearch.cluster.worker import Reply, this_machine
+from advsearch.cluster.workers import PoolWorkers
 
 
-@dataclass
-class Simulated:
-    """What `advsearch.cluster.Pool` asks for.
+@dataclass(eq=False)
+class SimulatedCall:
+    items: Sequence[Any]
+    future: Future[Any]
+    deaths: int = 0
+
+
+@dataclass(eq=False)
+class Simulated(WorkerExecutor):
+    """See `WorkerExecutor`.
 
     Attributes:
-        call: what a worker does with a range.
-        seconds: that a number takes, by its number.
-        load: seconds until a worker is ready.
+        call: what a worker does with items.
+        seconds: that an item takes, by the item.
+        load: seconds until a worker has loaded, with its first call.
         again: seconds after which another worker stands in the place of one that died; None for never.
-        lag: seconds until an answer arrives; a worker that dies takes those with it that have not.
-        kill: numbers of which a worker dies, at once.
-        hang: numbers that a worker never ends.
-        answers: what a worker says when it gets ready, by its name; else it is ready, and like this machine.
-        returns: whether a scheduler that has gone comes back.
+        lag: seconds until an answer arrives.
+        kill: items of which a worker dies, at once.
+        replies: what a worker says instead, by its name.
         now: the time.
-        link: of no page.
-        where: how it is called.
-        given: batches that were given to a worker, in order.
+        given: items of the calls that were submitted, in order.
         most: calls that were under way at once.
-        gone: whether the scheduler has gone, and nobody has connected again.
     """
 
     call: Callable[[Any], Any] = list
-    seconds: Callable[[Any], float] = lambda number: 0.5
+    seconds: Callable[[Any], float] = lambda item: 0.5
     load: float = 5.0
     lag: float = 0.0
     again: float | None = 1.0
-    kill: Collection[int] = ()
-    hang: Collection[int] = ()
-    answers: dict[str, Any] = field(default_factory=dict)
-    returns: bool = True
+    kill: Collection[Any] = ()
+    replies: dict[str, Reply] = field(default_factory=dict)
     now: float = 0.0
-    link: str = ""
-    where: str = "simulated"
     given: list[Any] = field(default_factory=list)
     most: int = 0
-    gone: bool = False
+    where: str = "simulated"
+    stats: WorkerStats = field(default_factory=WorkerStats)
     _events: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
-    _free_at: dict[str, float] = field(default_factory=dict)
-    _at: dict[Future[Any], str] = field(default_factory=dict)
-    _ended: deque[Future[Any]] = field(default_factory=deque)
+    _workers: dict[str, SimulatedCall | None] = field(default_factory=dict)
+    _idle: deque[str] = field(default_factory=deque)
+    _loaded: set[str] = field(default_factory=set)
+    _waiting: deque[SimulatedCall] = field(default_factory=deque)
     _made: int = 0
     _order: int = 0
-
-    @property
-    def ended(self) -> Any:
-        """The queue of a pool, whose time is simulated: `put`, `get` and `get_nowait` below."""
-        return self
 
     def clock(self) -> float:
         return self.now
 
     def add(self, count: int = 1, after: float = 0.0) -> None:
         for _ in range(count):
-            self._later(after, lambda name=f"w{self._made}": self._free_at.setdefault(name, self.now))  # type: ignore[misc]
-            self._made += 1
+            self.at(self.now + after, self._add_worker)
 
-    def _later(self, seconds: float, action: Callable[[], object]) -> None:
-        self._order += 1
-        heapq.heappush(self._events, (self.now + seconds, self._order, action))  # type: ignore[misc]
+    def _add_worker(self) -> None:
+        name = f"w{self._made}"
+        self._made += 1
+        self._workers[name] = None
+        self._idle.append(name)
+        self._give_out()
 
-    def at(self, time: float, action: Callable[[], object]) -> None:
+    def at(self, time: float, action: Callable[[], None]) -> None:
         """Do something to the workers at a time."""
-        self._later(time - self.now, action)
+        self._order += 1
+        heapq.heappush(self._events, (time, self._order, action))
 
     @property
     def alive(self) -> list[str]:
-        return list(self._free_at)
+        return list(self._workers)
 
     def end(self, worker: str) -> None:
-        """A worker dies; what it had gets no answer."""
-        if self._free_at.pop(worker, None) is None:
+        """A worker dies; another does what it had, unless enough have died of it."""
+        if worker not in self._workers:
             return
-        self._at = {future: one for future, one in self._at.items() if one != worker}
+        call = self._workers.pop(worker)
         if self.again is not None:
             self.add(after=self.again)
+        if call is None:
+            return
+        self.stats.lost += 1
+        call.deaths += 1
+        if call.deaths < DEATHS:
+            self._waiting.appendleft(call)
+            self._give_out()
+        else:
+            call.future.set_exception(WorkerDiedError(f"no answer: {DEATHS} workers died of it"))
 
     def lose_scheduler(self) -> None:
-        self.add(len(self._free_at), after=3.0)
-        self._free_at.clear()
-        self._at.clear()
-        self.gone = True
+        """What is under way is lost; the workers come back."""
+        calls = [*self._waiting, *filter(None, self._workers.values())]
+        self.add(len(self._workers), after=3.0)
+        self._workers.clear()
+        self._waiting.clear()
+        for call in calls:
+            with suppress(InvalidStateError):
+                call.future.set_exception(BrokenExecutor("the scheduler has gone"))
 
-    # ---- what the coordinator calls ---------------------------------------------------------------------------------
+    def count_workers(self) -> int:
+        return len(self._workers)
 
-    def workers(self) -> Collection[str]:
-        if self.gone:
-            raise SchedulerGoneError
-        return list(self._free_at)
-
-    def submit(self, worker: str, function: Callable[..., Any], *args: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        if worker not in self._free_at:
-            return future
-        self._at[future] = worker
-        self.most = max(self.most, len(self._at))
-        begin = max(self.now, self._free_at[worker])
-        if function is prepare:
-            told = self.answers.get(worker, Ready(HERE, self.load))
-            self._free_at[worker] = begin + self.load
-            self._answer(future, begin + self.load - self.now, told)
-            return future
-        _, items = args
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        _, items, _ = args
+        call = SimulatedCall(items, Future())
         self.given.append(items)
-        seconds = sum(map(self.seconds, items))
-        self._free_at[worker] = begin + seconds
-        if any(number in self.kill for number in items):
-            self._later(begin - self.now, lambda: self.end(worker))
-        elif any(number in self.hang for number in items):
-            self._free_at[worker] = float("inf")
-        elif begin + seconds < float("inf"):
-            self._answer(future, begin + seconds + self.lag - self.now, lambda: Carried(self.call(items), seconds))
-        return future
+        self._waiting.append(call)
+        self._give_out()
+        self.most = max(self.most, len(self._waiting) + sum(each is not None for each in self._workers.values()))
+        return call.future
 
-    def _answer(self, future: Future[Any], seconds: float, value: Any) -> None:
+    def _give_out(self) -> None:
+        while self._waiting and self._idle:
+            worker = self._idle.popleft()
+            if worker in self._workers:
+                self._begin(worker, self._waiting.popleft())
+
+    def _begin(self, worker: str, call: SimulatedCall) -> None:
+        self._workers[worker] = call
+        loading = 0.0 if worker in self._loaded else self.load
+        self._loaded.add(worker)
+        seconds = sum(map(self.seconds, call.items))
+        if any(item in self.kill for item in call.items):
+            self.at(self.now + loading, lambda: self.end(worker))
+            return
+
         def answer() -> None:
-            if self._at.pop(future, None) is not None and future.set_running_or_notify_cancel():
-                future.set_result(value() if callable(value) else value)
+            if self._workers.get(worker) is not call:
+                return  # it died
+            self._workers[worker] = None
+            self._idle.append(worker)
+            reply = Reply(self.call(call.items), seconds, loading, this_machine(), worker)
+            if call.future.set_running_or_notify_cancel():
+                call.future.set_result(self.replies.get(worker, reply))
+            self._give_out()
 
-        self._later(seconds, answer)
+        self.at(self.now + loading + seconds + self.lag, answer)
 
-    def restart(self, worker: str) -> None:
-        self.end(worker)
-
-    def put(self, future: Future[Any]) -> None:
-        self._ended.append(future)
-
-    def get(self, timeout: float) -> Future[Any]:
-        until = self.now + timeout
-        while self._events and not self._ended and self._events[0][0] <= until:
-            self.now, _, action = heapq.heappop(self._events)
+    def advance(self, seconds: float) -> None:
+        """Let what is next happen, within so long."""
+        until = self.now + seconds
+        if self._events and self._events[0][0] <= until:
+            time, _, action = heapq.heappop(self._events)
+            self.now = max(self.now, time)  # what was due meanwhile is late, not in the past
             action()
-        if not self._ended:
+        else:
             self.now = until
-        return self.get_nowait()
-
-    def get_nowait(self) -> Future[Any]:
-        if not self._ended:
-            raise queue.Empty
-        return self._ended.popleft()
-
-    def reconnect(self) -> None:
-        if not self.returns:
-            raise ClusterError("simulated: there is no scheduler that answers; go on with advsearch resume")
-        self.gone = False
-
-    def close(self) -> None:
-        pass
 
 
-def coordinator(pool: Simulated, tell: Callable[[str], None] = lambda text: None) -> Coordinator:
-    """A coordinator of a simulated pool."""
-    work = Work("nowhere:nothing", {})
-    return Coordinator(pool, work, "key", Files({}, {}), "1", HERE, tell, pool.clock)
+class SimulatedWorkers(PoolWorkers):
+    """`PoolWorkers` in simulated time."""
 
+    def __init__(self, executor: Simulated, tell: Callable[[str], None] = lambda text: None) -> None:
+        super().__init__(executor, WorkerTask("nowhere:nothing", {}), tell, executor.clock)
+        self.simulated = executor
 
-__all__ = ["HERE", "Failure", "Simulated", "coordinator"]
+    def _wait(self, ended: queue.SimpleQueue[Any]) -> Future[Any] | None:
+        if ended.empty():
+            self.simulated.advance(0.5)
+        return None if ended.empty() else ended.get_nowait()

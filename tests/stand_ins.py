@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Query, make_policy
 from advsearch.attacks.verification import WORST_CASE, Rule
-from advsearch.cluster import Done, InProcess, Work, Workforce
+from advsearch.cluster import BatchResult, InProcess, WorkerStats, WorkerTask
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Stages
@@ -185,15 +185,15 @@ class StandInWorkers:
     made: InProcess
     lost: tuple[int, ...] = ()
     given: list[int] = field(default_factory=list)
-    facts: Workforce | None = field(default_factory=lambda: Workforce(workers=2, most=2, busy=1.0, alive=2.0))
+    facts: WorkerStats | None = field(default_factory=lambda: WorkerStats(workers=2, most=2, busy=1.0, alive=2.0))
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         """The latest comes first."""
         first, listed = len(self.given), list(batches)
         for place, done in enumerate(self.made.results(reversed(listed))):
             self.given.append(len(listed) - 1 - place)
             away = "it died" if first + place in self.lost else ""
-            yield Done(done.items, None if away else done.value, "tcp://1", "ab12" if place else None, away)
+            yield BatchResult(done.items, None if away else done.value, "tcp://1", "ab12" if place else None, away)
 
 
 def shared(
@@ -202,8 +202,8 @@ def shared(
     """Let stand-ins carry out a call wherever it is asked for of these settings; all else is done in this process."""
     ready = StandInWorkers(InProcess(call(settings)), **more)
 
-    def executor_of(work: Work, **_: Any) -> nullcontext[StandInWorkers | None]:
+    def open_workers(work: WorkerTask, **_: Any) -> nullcontext[StandInWorkers | None]:
         return nullcontext(ready if work.function.endswith(f":{call.__name__}") else None)
 
-    monkeypatch.setattr(attacking, "executor_of", executor_of)
+    monkeypatch.setattr(attacking, "open_workers", open_workers)
     return ready

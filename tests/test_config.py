@@ -23,7 +23,6 @@ from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.files import MESHES, either
 from advsearch.questions.attack.settings import TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.questions.check.result import CheckConfig
-from advsearch.questions.gap import GapConfig
 from advsearch.questions.precision.result import QUANTITIES, PrecisionConfig
 from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.stability.result import StabilityConfig
@@ -45,6 +44,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "things": (3, "expected a text such as 'car@12,3.5', a mapping or a list of these, got 3"),
     "judge": ("", "expected object, the name of a thing beside it, or all, got ''"),
     "unit": ("ft", "expected mm, cm, m or in, got ft"),
+    "facing": ("ahead", "expected +x, -x, +y, -y, +z or -z, got ahead"),
     "camera": (
         "",
         "expected a name that advsearch import lists, orbit, dashcam, robot, fisheye, equirectangular, or a camera "
@@ -108,8 +108,8 @@ WRONG: dict[str, tuple[Any, str]] = {
 }
 
 GIVEN: dict[str, Any] = {
-    "object": "mug.obj", "environment": "room.hdr", "up": "y", "size": 4.9, "unit": "cm", "camera": "front",
-    "things": "car@1,2", "judge": "car",
+    "object": "mug.obj", "environment": "room.hdr", "up": "y", "facing": "-z", "size": 4.9, "unit": "cm",
+    "camera": "front", "things": "car@1,2", "judge": "car",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
     "labels": "labels.json", "prompt": "a photo of a {}", "ask": {"calls": 5.0}, "task": "detection",
@@ -236,7 +236,7 @@ def test_every_setting_of_every_command_says_what_it_is(config: type[Config]) ->
     "config",
     [
         AttackConfig(object="mug,bowl", workers=2, cluster="local"),
-        GapConfig(object="mug,bowl", controls=["pose", "camera"], average=50, run="x", steps=9),
+        AttackConfig(object="mug,bowl", controls=["pose", "camera"], average=50, run="x", steps=9),
         RegionConfig(
             object="mug", controls="pose", vary="pose.yaw,pose.pitch", map=24, samples=50, around="mug-pose-001"
         ),
@@ -259,12 +259,12 @@ def test_every_command_has_the_same_form_in_yaml_and_in_flags(config: Config, tm
 @pytest.mark.parametrize(
     ("config", "field", "value", "message"),
     [
-        (GapConfig, "average", 0, "expected a whole number from 1 to 1000000, got 0"),
+        (AttackConfig, "average", -1, "expected a whole number from 0 to 1000000, got -1"),
         (RegionConfig, "around", 3.5, "expected the name or the folder of a run, got 3.5"),
         (RegionConfig, "vary", [1], "expected names such as pose.yaw,camera.elevation, got [1]"),
         (RegionConfig, "samples", 7, "expected a whole number from 8 to 1000000, got 7"),
         (
-            GapConfig,
+            AttackConfig,
             "trials",
             1,
             "expected a whole number from 6 to 100000 (with fewer, nothing can be called found), got 1",
@@ -360,11 +360,10 @@ CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
     (AttackConfig, {"over": "camera", "controls": "camera.fov"}, "over: names a control that is searched already"),
     (AttackConfig, {"draws": 8}, "draws: is how many conditions of `over` a step looks at, and there are none"),
     (AttackConfig, {"over": "camera", "estimators": {"camera.fov": "secant"}}, "estimators: names a control that"),
-    (AttackConfig, {"average": 10, "epsilon": "0.1,0.2"}, "average: is not part of a curve"),
-    (GapConfig, {"smallest": True}, "smallest: `advsearch gap` has no such setting; leave it out"),
+    (AttackConfig, {"average": 10, "epsilon": "0.1,0.2"}, "average: is the average within one epsilon"),
     (RegionConfig, {"spp": 4}, "spp: `advsearch region` has no such setting; leave it out"),
     (RenderConfig, {"out": "a.png", "run": "it"}, "run: `advsearch render` has no such setting; leave it out"),
-    (GapConfig, {"epsilon": "0.1,0.2"}, "epsilon: several make a curve, which only `advsearch attack` draws"),
+    (CheckConfig, {"epsilon": "0.1,0.2"}, "epsilon: several make a curve, which only `advsearch attack` draws"),
     (SweepConfig, {"sampler": "random", "grid": {"pose.yaw": "0,90"}}, "sampler: is how `controls` are drawn"),
     (SweepConfig, {"fps": 5, "grid": {"pose.yaw": "0,90"}}, "fps: is of a drive; add `path`, or leave `fps` out"),
     (SweepConfig, {"trials": 0, "verify_spp": 8}, "verify_spp: is of the trials, and `trials` is 0"),
@@ -543,7 +542,7 @@ def test_a_policy_has_options_and_its_steps_are_the_runs(given: Any) -> None:
 
 
 @pytest.mark.parametrize("given", ["yaw={tolerance: 5}", {"name": "yaw", "tolerance": 5}])
-@pytest.mark.parametrize("config", [AttackConfig, SweepConfig, GapConfig, RegionConfig, RenderConfig])
+@pytest.mark.parametrize("config", [AttackConfig, SweepConfig, RegionConfig, RenderConfig])
 def test_a_task_has_options_as_a_policy_has(given: Any, config: type[SceneConfig], tmp_path: Path) -> None:
     needed: dict[Any, dict[str, Any]] = {SweepConfig: {"grid": {"pose.yaw": [0, 1]}}, RenderConfig: {"out": "a.png"}}
     own = needed.get(config, {})
@@ -600,12 +599,12 @@ def test_a_bad_base_is_named(tmp_path: Path, text: str, message: str) -> None:
         AttackConfig.from_yaml(path)
 
 
-@pytest.mark.parametrize("command", ["attack", "gap", "region", "check", "render", "precision"])
+@pytest.mark.parametrize("command", ["attack", "region", "check", "render", "precision"])
 @pytest.mark.parametrize("name", ["object", "environment", "model"])
 def test_several_of_a_kind_are_for_a_sweep(
     command: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if (name, command) in (("object", "attack"), ("object", "gap"), ("model", "attack")):
+    if (name, command) in (("object", "attack"), ("model", "attack")):
         return
     monkeypatch.chdir(tmp_path)
     flags = {"object": "mug", "environment": "noon", "model": "reference"} | {name: "one,two"}

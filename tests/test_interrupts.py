@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 from conftest import ROOT
-from simulated_cluster import Simulated, coordinator
+from simulated_cluster import Simulated, SimulatedWorkers
 from small_models import easy
 
 from advsearch.cli.output import LookingProgress
@@ -115,7 +115,7 @@ def model_answers() -> Any:
 
 
 def workers_results() -> Any:
-    return list(coordinator(Simulated()).results([range(2)]))
+    return list(SimulatedWorkers(Simulated()).results([range(2)]))
 
 
 def progress_advances() -> None:

@@ -22,7 +22,7 @@ from types import ModuleType
 import reference_scenes
 import torch
 
-from advsearch.attacks import POLICIES, candidates, clopper_pearson, planned_renders, trials, verification
+from advsearch.attacks import POLICIES, candidates, planned_renders, trials, verification
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
@@ -36,19 +36,23 @@ from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.questions.attack import stages
 from advsearch.questions.attack.settings import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
-from advsearch.questions.gap import GapResult
 from advsearch.questions.region import growing as mapping
 from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test import counterexamples as tested
+from advsearch.registry import EXPERIMENTS
 from advsearch.runs import directory, export, store
+from advsearch.runs.exporters import EXPORTERS
 from advsearch.runs.results import RenderResult, Result
 from advsearch.scene import formation, library
 from advsearch.scene.geometry import FRAME_FILL
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT
+from advsearch.scene.importing.readers import READERS
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import settings
+from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
+from advsearch.statistics.sequential import draws_needed
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -192,7 +196,7 @@ PLAIN = set(
 
 def results() -> Iterator[str]:
     """Fields of results say what they hold; columns and files of a run are in the page about runs."""
-    kinds: list[type[Result]] = [AttackSummary, SweepSummary, GapResult, CurveResult, MatrixResult, RenderResult]
+    kinds: list[type[Result]] = [AttackSummary, SweepSummary, CurveResult, MatrixResult, RenderResult]
     for kind in kinds:
         silent = {name for name, field in kind.described().items() if not script("make_figures")._field(field)}
         if not (kind.__doc__ and kind.command) or silent - PLAIN:
@@ -246,7 +250,7 @@ def _exceptions(samples: int) -> float:
 
 def _draws(mean: float, value: float = 1.0) -> int:
     """Pictures that decide a claim where all predictions are alike."""
-    return trials.draws_needed(mean, confidence=trials.CONFIDENCE, value=value)
+    return draws_needed(mean, confidence=CONFIDENCE, value=value)
 
 
 MADE_BY_HAND = [
@@ -354,7 +358,8 @@ def words() -> Iterator[str]:
 MADE_UP = {"tests/test_architecture.py", "tests/test_docs.py", "tests/test_registry.py"}
 """Tests of such rules, which name modules that are not there."""
 NAME = re.compile(r"(?<![\w./-])`?(advsearch(?:\.[A-Za-z_]\w*)+)(?:\(\))?`?(?![\w/-])")
-GROUPS = {one.group for one in (CONTROLS, OBJECTIVE_KINDS, POLICIES, SOURCES_OF_MODELS)}
+REGISTERED = (CONTROLS, EXPERIMENTS, EXPORTERS, OBJECTIVE_KINDS, POLICIES, READERS, SOURCES_OF_MODELS)
+GROUPS = {registry.group for registry in REGISTERED}
 """Groups of entry points, which are names and no modules."""
 PATH = re.compile(rf"(?<![\w./-])((?:{'|'.join(FOLDERS)})/[\w./-]*\w\.(?:py|md|sh|json|png))")
 PLACEHOLDER = re.compile(r"\b[A-Z]{4,}\.")

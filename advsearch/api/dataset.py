@@ -33,7 +33,7 @@ from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, read_python_only
-from advsearch.runs.files import check_free_folder, placed_by, storage_errors, write_png, write_text
+from advsearch.runs.files import write_png
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.scene.assets import Bools
 from advsearch.scene.description import OBJECT
@@ -43,6 +43,7 @@ from advsearch.settings import read_yaml
 from advsearch.tasks import Facts, Task
 from advsearch.tasks.classification import ClassTask
 from advsearch.tasks.together import Together
+from advsearch.trust.writing import check_free_folder, placed_by, storage_errors, write_text
 
 IMAGES, LABELS, COCO, YOLO = "images", "labels", "annotations.json", "data.yaml"  # what is in the folder of a dataset
 CLEAN = ("first control", "control")  # kinds of rows of an attack that look at the clean scene

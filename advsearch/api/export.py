@@ -32,7 +32,7 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
 from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
-from advsearch.runs.files import placed_by, read_png, storage_errors, to_8bit, write_bytes, write_text
+from advsearch.runs.files import read_png, to_8bit
 from advsearch.scene.assembly import ON_PICTURE, posed
 from advsearch.scene.assets import Floats, Ints, Mesh
 from advsearch.scene.description import NO_MAP, OBJECT
@@ -40,6 +40,7 @@ from advsearch.scene.glb import PLAIN, glb
 from advsearch.scene.mitsuba_backend.writing import NAME, SCATTERINGS, write_scene
 from advsearch.scene.parts import HazePart
 from advsearch.scene.raster import doubled_areas, rasterised
+from advsearch.trust.writing import placed_by, storage_errors, write_bytes, write_text
 
 GLB, XML = ".glb", ".xml"
 
@@ -176,7 +177,7 @@ def real_size(run: str | Path) -> float | None:
 
 
 def _alone(config: AttackConfig) -> Scene:
-    return load_scene(config.object, NO_MAP, up=config.up, size=config.size, unit=config.unit)
+    return load_scene(config.object, NO_MAP, up=config.up, facing=config.facing, size=config.size, unit=config.unit)
 
 
 def printable(run: str | Path, size: float) -> list[Piece]:

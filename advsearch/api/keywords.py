@@ -22,12 +22,12 @@ from advsearch.config import SEVERAL
 from advsearch.engine import loading
 from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, in_turn, model_name
 from advsearch.errors import InputError
-from advsearch.files import is_shallow
 from advsearch.models import Model
 from advsearch.options import told
 from advsearch.progress import watched
-from advsearch.registry import allow_named
 from advsearch.settings import Config, PythonOnly, as_python, settings
+from advsearch.trust.code import allow_named
+from advsearch.trust.stored_files import is_shallow
 
 Names = str | Sequence[str]  # names in a list, or in a text with commas between them
 LOADED = (loading.Scene, Model, nn.Module)  # what a question may be given in place of a name

@@ -16,9 +16,10 @@ from advsearch.controls.projector import ProjectorControl
 from advsearch.controls.space import file_name
 from advsearch.controls.support.images import enlarged
 from advsearch.errors import InputError
-from advsearch.runs.files import placed_by, storage_errors, write_png, write_text
+from advsearch.runs.files import write_png
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.color import linear_to_srgb
+from advsearch.trust.writing import placed_by, storage_errors, write_text
 
 ROWS = 1024  # least height of the pictures to project, in pixels
 SHARES = (1 / 8, 1 / 2, 7 / 8)  # where the nine marks are in a picture, of its width and height

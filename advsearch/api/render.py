@@ -24,7 +24,6 @@ from advsearch.engine.naming import check_run_settings, given_to, in_turn, load_
 from advsearch.engine.rendering import Rendering as Rendering
 from advsearch.engine.rendering import pictures_of, writable
 from advsearch.errors import InputError
-from advsearch.files import read_bytes
 from advsearch.models import Model
 from advsearch.progress import NullProgress, Progress, shows_progress
 from advsearch.questions.attack.carry_out import parts_in
@@ -32,15 +31,15 @@ from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.sweep.result import SweepResult
 from advsearch.questions.sweep.summary import SweepSummary
-from advsearch.registry import allow_named, names_code
 from advsearch.runs.directory import ARTIFACTS, IMAGES, find_run
 from advsearch.runs.files import read_png
 from advsearch.runs.results import RenderResult, Result
 from advsearch.runs.summary import read_configuration, read_result
 from advsearch.scene.formation import aovs_of
-from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.hdr import read_exr
 from advsearch.tasks import AnyTask, make_task
+from advsearch.trust.code import allow_named, names_code
+from advsearch.trust.stored_files import LARGEST_FILE, read_bytes
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -52,9 +51,9 @@ if TYPE_CHECKING:
 def load_run(run: str | Path) -> AttackResult | SweepResult | Result:
     """Return the result of a run from its folder, of the type that the function of its question returns.
 
-    An attack's is an `AttackResult`, a sweep's a `SweepResult`, `gap`'s a `GapResult`, and so on; of several epsilons
-    or models, which only a command attacks, it is the table of them. `search` of a loaded attack is None:
-    `rows("search")` has its steps. Nothing is rendered, and no scene or model is loaded before `render` asks for them.
+    An attack's is an `AttackResult`, a sweep's a `SweepResult`, and so on; of several objects, epsilons or models,
+    which only a command attacks, it is the table of them. `search` of a loaded attack is None: `rows("search")` has its
+    steps. Nothing is rendered, and no scene or model is loaded before `render` asks for them.
 
     Args:
         run: its name, which stands for runs/NAME, or its folder.

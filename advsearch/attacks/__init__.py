@@ -13,8 +13,9 @@ from advsearch.attacks.policies.evolution import CMAES, NES
 from advsearch.attacks.policies.pgd import PGD, Adam
 from advsearch.attacks.policies.sampling import Grid, Random, Sobol
 from advsearch.attacks.search import SearchResult, StepRecord, planned_renders, search
-from advsearch.attacks.trials import SampleCount, Trials, choose_spp, clopper_pearson
+from advsearch.attacks.trials import SampleCount, Trials, choose_spp
 from advsearch.attacks.verification import Ending, Verification, count_right, run_trials, verify
+from advsearch.statistics.intervals import clopper_pearson
 
 __all__ = [
     "CMAES", "NES", "OBJECTIVES", "PGD", "POLICIES", "Adam", "Auto", "Block", "Choices", "Domain", "Ending", "Evaluate",

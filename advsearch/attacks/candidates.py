@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.trials import CONFIDENCE, edge_of
 from advsearch.errors import InputError
+from advsearch.statistics.intervals import CONFIDENCE
+from advsearch.statistics.sequential import edge_of
 
 SAME = 1e-4  # configurations that differ by less than this in every element are one candidate (an 8-bit level is 4e-3)
 

@@ -7,82 +7,21 @@ with the sample count, and a verification in the middle of that drift credits th
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise, product
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import bdtr, betaincinv, ndtr, ndtri, stdtrit
+from scipy.special import ndtr, stdtrit
 from torch import Tensor
 
 from advsearch.attacks.evaluation import Evaluate, Query
 from advsearch.errors import InputError
 from advsearch.seeds import stream
-
-CONFIDENCE = 0.95  # confidence of every interval that is printed
-
-
-def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the exact two-sided binomial interval of a success rate.
-
-    Of k successes, from 0 to n, in n trials, at least 1, with a = 1 - confidence in (0, 1): low solves P(X >= k | low)
-    = a/2 and high P(X <= k | high) = a/2, quantiles of beta distributions: B(a/2; k, n - k + 1), exactly 0 for k = 0,
-    and B(1 - a/2; k + 1, n - k), exactly 1 for k = n. The interval covers the true rate at least as often as it says,
-    at every n (Clopper and Pearson 1934). Raises InputError where an argument is out of range.
-    """
-    if trials < 1:
-        raise InputError(f"trials: expected at least 1, got {trials}")
-    if not 0 <= successes <= trials:
-        raise InputError(f"successes: expected a number from 0 to {trials}, got {successes}")
-    if not 0.0 < confidence < 1.0:
-        raise InputError(f"confidence: expected a number between 0 and 1, got {confidence}")
-    tail = (1.0 - confidence) / 2.0
-    low = 0.0 if successes == 0 else float(betaincinv(successes, trials - successes + 1, tail))
-    high = 1.0 if successes == trials else float(betaincinv(successes + 1, trials - successes, 1.0 - tail))
-    return low, high
-
-
-def paired_difference(both: int, first: int, second: int, neither: int) -> tuple[float, tuple[float, float]]:
-    """Return how much more often the second of two paired outcomes happens than the first, and its 95 % interval, from
-    counts of pairs: both, the first alone, the second alone, neither. It comes from the Wilson intervals of both shares
-    and their correlation (Newcombe 1998, "Improved confidence intervals for the difference between binomial proportions
-    based on paired data", method 10)."""
-    n = both + first + second + neither
-    if n < 1 or min(both, first, second, neither) < 0:
-        raise InputError(f"pairs: expected at least one, got {both}, {first}, {second} and {neither}")
-    shares = (both + second) / n, (both + first) / n
-    (low, high), (other_low, other_high) = (map(float, wilson(share, n)) for share in shares)
-    spread = (both + first) * (second + neither) * (both + second) * (first + neither)
-    covariance = float(both * neither - first * second)
-    if covariance > 0.0:
-        covariance = max(covariance - n / 2.0, 0.0)
-    phi = covariance / math.sqrt(spread) if spread else 0.0
-    (p, q), down = shares, (shares[0] - low, other_high - shares[1])
-    up = high - shares[0], shares[1] - other_low
-    below, above = (math.sqrt(max(0.0, a * a - 2 * phi * a * b + b * b)) for a, b in (down, up))
-    return p - q, (max(-1.0, p - q - below), min(1.0, p - q + above))
-
-
-def mcnemar(first: int, second: int) -> float:
-    """Return how likely it is, in (0, 1], that of pairs in which one outcome alone happens, chance splits so many so
-    unevenly: the exact, two-sided test of McNemar (1947, "Note on the sampling error of the difference between
-    correlated proportions or percentages"): twice the smaller tail of the binomial distribution, as these pairs are
-    throws of a fair coin where neither happens more often."""
-    if min(first, second) < 0:
-        raise InputError(f"pairs: expected numbers from 0, got {first} and {second}")
-    return min(1.0, 2.0 * float(bdtr(min(first, second), first + second, 0.5))) if first + second else 1.0
-
-
-def wilson(share: Any, n: Any) -> tuple[Any, Any]:
-    """Return both ends of Wilson's score interval (1927) of shares of n, 95 %; numbers or arrays."""
-    z = float(ndtri(0.5 + CONFIDENCE / 2.0))
-    middle, half = share + z * z / (2 * n), z * np.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
-    return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
+from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
 
 
 @dataclass(frozen=True)
@@ -107,108 +46,6 @@ class Trials:
 def trial_seed(seed: int, number: int) -> int:
     """Return the seed of a trial, by its number: the same for all groups with that root."""
     return stream(seed, "verification", number)
-
-
-def edge_of(beyond: Callable[[float], bool]) -> float:
-    """Return where in (0, 1) a condition begins to hold, 0 or 1 where it holds everywhere or nowhere."""
-    low, high = 1e-9, 1.0 - 1e-9
-    if beyond(low):
-        return 0.0
-    if not beyond(high):
-        return 1.0
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if beyond(middle) else (middle, high)
-    return high
-
-
-STAKES = np.array([1.0, 0.9, 0.75, 0.5, 0.25, 0.125, 0.0625, 0.03125])
-"""Among which the capital is shared equally. Large ones decide soon where nearly all draws agree."""
-
-
-@dataclass
-class ConfidenceSequence:
-    """Draws in [0, 1], and an interval of their mean that holds after each of them: one may stop as soon as it decides.
-
-    Of draws x_1, x_2, ... whose mean is m, whatever was drawn before, a gambler who stakes a share c of what he has, on
-    "more than m" or on "less than m", plays a fair game:
-
-        K_t(m, c) = prod_s (1 - c + c x_s / m)       and       prod_s (1 - c + c (1 - x_s) / (1 - m))
-
-    His capital, a mean over stakes c, exceeds 2 / a at some time with a probability of a / 2 at most (Ville 1939). So
-    the m at which neither does are an interval that holds m at all times with a probability of 1 - a at least: the
-    hedged capital of Waudby-Smith and Ramdas 2024, "Estimating means of bounded random variables by betting", with
-    stakes that are fixed (`benchmarks/sequential.py`).
-
-    Attributes:
-        confidence: of the interval, at all times together; over 0 and under 1.
-        sides: 2 of the whole interval; 1 of each end by itself, for a claim "at least so much": if it is true only
-            `is_under` can be wrong, and else only `is_over`, so that each may be as often as the other says.
-    """
-
-    confidence: float = CONFIDENCE
-    sides: int = 2
-    _counts: Counter[float] = field(default_factory=Counter)
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.confidence < 1.0:
-            raise InputError(f"confidence: expected a number between 0 and 1, got {self.confidence}")
-
-    def add(self, value: float) -> None:
-        if not 0.0 <= value <= 1.0:
-            raise InputError(f"draw: expected a number from 0 to 1, got {value}")
-        self._counts[value] += 1
-
-    @property
-    def count(self) -> int:
-        return self._counts.total()
-
-    @property
-    def mean(self) -> float:
-        return sum(value * count for value, count in self._counts.items()) / self.count if self.count else math.nan
-
-    def is_over(self, mean: float) -> bool:
-        """Whether the true mean is shown to be over a number in (0, 1)."""
-        return self._won(mean, self._counts)
-
-    def is_under(self, mean: float) -> bool:
-        """Whether the true mean is shown to be under a number in (0, 1)."""
-        return self._won(1.0 - mean, {1.0 - value: count for value, count in self._counts.items()})
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Both ends of the means that are not excluded; `is_over` and `is_under` are monotone in the mean."""
-        return edge_of(lambda mean: not self.is_over(mean)), edge_of(self.is_under)
-
-    def _won(self, mean: float, counts: Mapping[float, int]) -> bool:
-        return bool(capital(mean, counts) >= np.log(self.sides / (1.0 - self.confidence)))
-
-
-def draws_needed(mean: float, *, confidence: float, value: float = 1.0) -> int:
-    """Return how many draws, all of one value over a mean in (0, 1), show that the true one is over it, by one side of
-    a `ConfidenceSequence`: no others show it sooner where the value is 1."""
-
-    def shown(count: int) -> bool:
-        return capital(mean, {value: count}) >= math.log(1.0 / (1.0 - confidence))
-
-    high = 1
-    while not shown(high):
-        high *= 2
-    return bisect_left(range(1, high + 1), True, key=shown) + 1
-
-
-def capital(mean: float, counts: Mapping[float, int]) -> float:
-    """Return the logarithm of what the bets on "more than `mean`" have made of 1, -inf where all is lost."""
-    values = np.array(list(counts), dtype=np.float64)
-    return capital_of_units(mean, values, np.ones_like(values), np.array(list(counts.values())))
-
-
-def capital_of_units(mean: float, counted: npt.NDArray[Any], of: npt.NDArray[Any], times: npt.NDArray[Any]) -> float:
-    """Return the same of units (n,), so many `times` each, that count for `of` draws of the largest; see `units`."""
-    with np.errstate(divide="ignore"):
-        won = np.log(np.maximum(1.0 - STAKES * of[:, None] + STAKES * (counted / mean)[:, None], 0.0))
-        total = (times[:, None] * won).sum(axis=0)
-    return float(np.logaddexp.reduce(total) - np.log(len(STAKES)))
 
 
 LADDER = (4, 16, 64, 256)  # sample counts to try; each quarters the variance of the one before
@@ -438,123 +275,3 @@ def moved(here: Floats, below: Floats) -> float:
     ends = np.array([0.0, change.mean() - half, change.mean() + half])[:, None]
     shares = ndtr((here + ends) / max(width, 1e-12)).mean(axis=1)
     return float(np.abs(shares[1:] - shares[0]).max())
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Shares of predictions that are not independent: frames of a drive, and what several models say of a picture, share
-# one draw. What was drawn, the *unit*, is independent of others, so that intervals and tests are over units.
-#
-# Of units with o_u predictions each, of which k_u count, the share is sum k_u / sum o_u. With m for the true one and O
-# for the largest o_u, who stakes a share c of what he has, at each unit, on "more than m" wins nothing on average:
-#
-#     K(m, c) = prod_u (1 - c o_u / O + c k_u / (O m))
-#
-# So K exceeds 2 / a with a probability of a / 2 at most (Markov), whatever units are like and however few there are,
-# also where each has a share of its own (the product's mean is at most 1, by the inequality of the means). These are
-# the bets of `ConfidenceSequence`, whose stakes they take. Where each unit has one prediction, the exact tests
-# of independent ones are taken, which are sharper: Clopper and Pearson, Newcombe, McNemar.
-
-Numbers = npt.NDArray[np.float64]
-Units = npt.NDArray[np.int64]
-
-
-def per_unit(values: npt.ArrayLike, units: Units) -> Numbers:
-    """Return the sums (m,) of values (n,) over each of the units that the rows (n,) belong to, in their order."""
-    _, places = np.unique(units, return_inverse=True)
-    return np.bincount(places.reshape(-1), np.asarray(values, dtype=np.float64)).astype(np.float64)
-
-
-def share_interval(counted: npt.ArrayLike, of: npt.ArrayLike, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Return the interval of a share of predictions, whatever the number of independent units. Each has predictions,
-    (n,) from 0, and one of them some; `counted` are (n,) from 0 to `of`; the confidence is between 0 and 1."""
-    k, o = np.asarray(counted, dtype=np.float64), np.asarray(of, dtype=np.float64)
-    if k.shape != o.shape or not o.size or o.max() <= 0 or (k < 0).any() or (k > o).any():
-        raise InputError("share: expected counts from 0 to the predictions of each unit, and one prediction at least")
-    if o.max() == 1.0:
-        return clopper_pearson(round(k.sum()), round(o.sum()), confidence)
-    return _by_bets(k, o, confidence)
-
-
-def _by_bets(counted: Numbers, of: Numbers, confidence: float) -> tuple[float, float]:
-    rows, times = np.unique(np.stack([counted, of - counted, of], axis=1) / of.max(), axis=0, return_counts=True)
-    least = np.log(2.0 / (1.0 - confidence))
-    low = edge_of(lambda mean: capital_of_units(mean, rows[:, 0], rows[:, 2], times) < least)
-    return low, edge_of(lambda mean: capital_of_units(1.0 - mean, rows[:, 1], rows[:, 2], times) >= least)
-
-
-def mean_interval(values: npt.ArrayLike, low: float, high: float) -> tuple[float, float]:
-    """Return the 95 % interval of the mean of independent numbers (n,) in a range that is known beforehand."""
-    numbers = np.asarray(values, dtype=np.float64)
-    if high <= low:
-        return low, low
-    shares = np.clip((numbers - low) / (high - low), 0.0, 1.0)
-    first, last = _by_bets(shares, np.ones(len(shares)), CONFIDENCE)
-    return low + (high - low) * first, low + (high - low) * last
-
-
-def most_shown(units: int) -> float:
-    """Return the lower end of a share's 95 % interval where so many units are right throughout: the most to show."""
-    return _by_bets(np.ones(units), np.ones(units), CONFIDENCE)[0]
-
-
-def paired_by_unit(first: Any, second: Any, units: Units) -> tuple[float, tuple[float, float], float]:
-    """Return how much more often the second of two outcomes (n,) happens than the first, the 95 % interval of that, and
-    how likely it is that chance parts them as far where neither happens more often, in (0, 1]; rows (n,) of one unit
-    are not independent. The interval is without 0 where that is at most 0.05."""
-    first, second = np.asarray(first, dtype=bool), np.asarray(second, dtype=bool)
-    if len(np.unique(units)) == len(units):
-        both, lost, won = (first & second).sum(), (first & ~second).sum(), (~first & second).sum()
-        counts = int(both), int(lost), int(won), len(first) - int(both + lost + won)
-        return *paired_difference(*counts), mcnemar(counts[1], counts[2])
-    of = per_unit(np.ones(len(first)), units)
-    ahead = per_unit((1.0 + second - 1.0 * first) / 2.0, units)
-    low, high = _by_bets(ahead, of, CONFIDENCE)
-    scaled = np.stack([ahead, of - ahead, of]) / of.max()
-    won = max(capital_of_units(0.5, scaled[side], scaled[2], np.ones(len(of))) for side in (0, 1))
-    return float(second.mean() - first.mean()), (2 * low - 1, 2 * high - 1), float(min(1.0, 2.0 * np.exp(-won)))
-
-
-SHARES = np.linspace(0.0, 1.0, 402)[1:-1]  # of right predictions on both sides, at which two shares are compared
-EXCHANGES = 9_999  # how often units are dealt out anew, so that no probability is under 0.0001
-
-
-def fewer_by_chance(
-    inside: npt.ArrayLike, of: npt.ArrayLike, beside: npt.ArrayLike, rest: npt.ArrayLike, times: float = 1.0
-) -> float:
-    """Return how likely it is, in (0, 1], that so few predictions or fewer are right on one side of a rule, if as many
-    are right on the other.
-
-    Where each unit has one prediction that is Fisher's exact test, one-sided. Where all units have as many and lie on
-    one side each, units are dealt out to the sides anew. Where the rule cuts through units, it is one over the least
-    that bets on "fewer here than m, more there" have made of 1, of all m: a bound, also where sides of a unit are
-    alike.
-
-    Args:
-        inside, of: (n,) of each unit, right predictions and predictions under the rule.
-        beside, rest: (n,) those elsewhere.
-        times: how many times there are each of these units.
-    """
-    k, a, r, b = (np.asarray(counts, dtype=np.float64) for counts in (inside, of, beside, rest))
-    if not a.any() or not b.any():
-        return 1.0
-    if (a + b).max() == 1.0:
-        from scipy.stats import hypergeom  # takes half a second, and a search needs none of it
-
-        here, there, right, others = (round(times * float(counts.sum())) for counts in (k, a, r, b))
-
-        return float(hypergeom.cdf(here, there + others, here + right, there))
-    if (np.minimum(a, b) == 0.0).all() and len(np.unique(a + b)) == 1:
-        values, copies = np.unique(k + r, return_counts=True)
-        copies, dealt = np.round(times * copies).astype(np.int64), round(times * float((a > 0).sum()))
-        rng = np.random.default_rng(0)
-        drawn = rng.multivariate_hypergeometric(copies, min(dealt, int(copies.sum())), EXCHANGES, method="marginals")
-        return float((1 + (drawn @ values <= times * k.sum() + 1e-9).sum()) / (1 + EXCHANGES))
-    rows, copies = np.unique(np.stack([a - k, a, r, b], axis=1), axis=0, return_counts=True)
-    wrong, under, right, others = rows.T
-    half = np.where((under > 0) & (others > 0), 0.5, 1.0)[:, None]
-    bets = half * (wrong[:, None] / (1.0 - SHARES) - under[:, None]) / a.max()
-    bets += half * (right[:, None] / SHARES - others[:, None]) / b.max()
-    with np.errstate(divide="ignore"):
-        won = [times * (copies[:, None] * np.log(np.maximum(1.0 + stake * bets, 0.0))).sum(axis=0) for stake in STAKES]
-    least = (np.logaddexp.reduce(won, axis=0) - np.log(len(STAKES))).min()
-    return float(min(1.0, np.exp(-least)))

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluate, Query
-from advsearch.attacks.trials import CONFIDENCE, Trials, clopper_pearson, trial_seed
+from advsearch.attacks.trials import Trials, trial_seed
 from advsearch.errors import InputError
+from advsearch.statistics.intervals import CONFIDENCE, clopper_pearson
 from advsearch.tasks import Judgement
 
 

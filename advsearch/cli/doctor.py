@@ -26,8 +26,8 @@ from advsearch import __version__, threads
 from advsearch.cli import output
 from advsearch.cli.main import command
 from advsearch.errors import FELL_SHORT, AdvsearchError
-from advsearch.registry import OWN_FOLDER
 from advsearch.scene.mitsuba_backend import llvm
+from advsearch.trust.code import OWN_FOLDER
 
 OK, WARNING, MISSING, BROKEN = "ok", "warning", "missing", "broken"
 """The states of a part. A warning does not keep anything from running."""

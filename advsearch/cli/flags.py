@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 from advsearch.config import CONFIGS
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.registry import allow_named
 from advsearch.settings import (
     Config,
     Setting,
@@ -26,6 +25,7 @@ from advsearch.settings import (
     settings,
     split_names,
 )
+from advsearch.trust.code import allow_named
 
 _NO_SETTINGS = {"code": "--code", "sheets": "--sheets", "paper": "--paper", "size": "--size"}
 """Flags which messages name too and which are no setting of a configuration."""

@@ -51,6 +51,7 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
     materials = {name: len(faces) for name, faces in whole.mesh.materials.items()}
     width, height = whole.base_color.shape[1::-1]
     up = None if whole.up is None else whole.up.axis
+    front = None if whole.front is None else whole.front.axis
     clips, moved = (list(rig.clips), list(rig.defaults)) if rig is not None else ([], [])
     joints = [name.removesuffix(".x") for name in moved if name.endswith(".x")]
     targets = [name.removesuffix(".weight") for name in moved if name.endswith(".weight")]
@@ -65,6 +66,7 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
         "triangles": len(whole.mesh.faces),
         "texture": [width, height],
         "up": up,
+        "front": front,
         "materials": [{"name": name, "triangles": count} for name, count in materials.items()],
         "nodes": [{"name": n.name, "mesh": n.mesh, "triangles": n.triangles, "size": list(n.size)} for n in nodes],
         "lights": list(inside.lights),
@@ -73,7 +75,7 @@ def _mesh_file(file: str, inside: Contents) -> Understood:
         "slow": slow,
         "warnings": list(whole.warnings),
     }
-    lines = [f"{file}: {len(whole.mesh.faces):,} triangles, a texture of {width} x {height}, {up} up"]
+    lines = [f"{file}: {len(whole.mesh.faces):,} triangles, a texture of {width} x {height}, {up} up, front {front}"]
     if nodes:
         sizes = [" x ".join(f"{side:.3g}" for side in node.size) for node in nodes]
         rows = [[n.name, n.mesh, f"{n.triangles:,} triangles", size] for n, size in zip(nodes, sizes, strict=True)]

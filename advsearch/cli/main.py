@@ -22,14 +22,8 @@ from advsearch.cli import output
 from advsearch.cli.output import BAD_INPUT, INTERRUPTED, OK, at_work, end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, CodeNotAllowedError, InputError, UnknownNameError
 from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
-from advsearch.registry import (
-    EXPERIMENTS,
-    allow_code,
-    get_experiment,
-    get_experiment_help,
-    imported,
-    nothing_allowed,
-)
+from advsearch.registry import EXPERIMENTS, get_experiment, get_experiment_help, imported
+from advsearch.trust.code import allow_code, nothing_allowed
 
 if TYPE_CHECKING:
     from advsearch.experiment import Experiment
@@ -154,7 +148,7 @@ class ExperimentCommand:
 
 GROUPS = {
     "ask: what does a model get wrong?": dict.fromkeys(
-        ("attack", "sweep", "gap", "region", "explain", "compare", "recipe", "harden"), ""
+        ("attack", "sweep", "region", "explain", "compare", "recipe", "harden"), ""
     ),
     "look: at scenes, names and predictions": {
         "render": "",
@@ -308,13 +302,24 @@ def _parse(words: list[str], command: str | None) -> argparse.Namespace:
     parser, subparsers = without_commands()
     for name in list_commands():
         add_command(subparsers, name, whole=name == command)
-    args, unknown = parser.parse_known_args(words)
+    args, unknown = parser.parse_known_args(_join_negative_axis(words))
     if unknown:
         raise _unknown_argument(unknown[0], subparsers.choices[args.command] if args.command else parser)
     if args.command is None:
         parser.print_help()
         parser.exit()
     return args
+
+
+def _join_negative_axis(words: list[str]) -> list[str]:
+    """Return the words with `--facing -z` as one, as argparse takes `-z` for a flag."""
+    joined: list[str] = []
+    for word in words:
+        if joined and joined[-1] == "--facing" and word in ("-x", "-y", "-z"):
+            joined[-1] = f"--facing={word}"
+        else:
+            joined.append(word)
+    return joined
 
 
 def without_commands() -> tuple[argparse.ArgumentParser, argparse._SubParsersAction[Any]]:

@@ -48,8 +48,8 @@ def report(args: argparse.Namespace) -> int:
     # late, so that --help answers at once
     from advsearch.questions.report.evidence import collected, read_exposure
     from advsearch.questions.report.result import evidence_page, markdown
-    from advsearch.runs.files import write_bytes, write_text
     from advsearch.runs.summary import to_json
+    from advsearch.trust.writing import write_bytes, write_text
 
     if not args.evidence:
         raise InputError(
@@ -107,9 +107,9 @@ def _take_in(folder: str, name: str) -> None:
 def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
     """Copy the photographs that `POSES` lists, each under the name of the rendering that has its pose."""
     # late, so that --help answers at once
-    from advsearch.files import read_text
     from advsearch.runs.store import NAME as STORE
     from advsearch.runs.store import Store
+    from advsearch.trust.stored_files import read_text
 
     with Store(run / STORE, read_only=True) as store:
         rows = [(row.step, {name: value["value"] for name, value in row.values.items()}) for row in store.rows("sweep")]

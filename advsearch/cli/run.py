@@ -13,11 +13,12 @@ from advsearch.cli.flags import command_in, config_of_file
 from advsearch.cli.main import argument, command
 from advsearch.cli.show import show_run
 from advsearch.errors import InputError
-from advsearch.registry import allow_named, get_experiment
+from advsearch.registry import get_experiment
 from advsearch.runs.directory import CONFIG, HOME, REPORT, find_run, read_python_only
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.settings import parse_assignment
 from advsearch.settings.values import put
+from advsearch.trust.code import allow_named
 from advsearch.viewer.pages import write_page
 
 

@@ -20,12 +20,13 @@ from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
-from advsearch.registry import Registry, allow_named, get_first_doc_line, imported
+from advsearch.registry import Registry, get_first_doc_line, imported
 from advsearch.report.wording import count, interval_text
 from advsearch.runs.directory import IMAGES, find_run
 from advsearch.runs.listing import Listed, listed_run
 from advsearch.runs.results import plain
 from advsearch.runs.summary import NAME, read_result
+from advsearch.trust.code import allow_named
 
 if TYPE_CHECKING:
     from advsearch.controls import Choice, Parameter
@@ -174,6 +175,8 @@ def _of_choice(choice: Choice) -> dict[str, str]:
     allowed = ", ".join(choice.options)
     if choice.whole:
         allowed = f"{choice.whole[0]} to {choice.whole[1]}"
+    elif choice.most and choice.signed:
+        allowed = f"{-choice.most:g} to {choice.most:g}"
     elif choice.most:
         allowed = f"over 0 to {choice.most:g}"
     default = _cell(choice.default)

@@ -1,130 +1,112 @@
-"""Work on many processors: batches carried out by an `Executor`, in this process (`InProcess`), or on a `Pool` of
-workers (`coordinator.Coordinator`). Anybody may do it, any number of times: it depends on the batch and the run's
-settings alone."""
+"""Work on several processors: batches, done here (`InProcess`) or by worker processes (`workers.open_workers`).
+
+Workers stand behind one interface, `concurrent.futures.Executor`: a pure function of a module and picklable arguments
+go in, a future comes out. What a batch comes to depends on the batch and the run's settings alone, so that anybody may
+do it, any number of times."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
-from queue import SimpleQueue
 from typing import Any, Protocol
 
 from advsearch.files import JsonObject
-from advsearch.registry import allowed_code
+from advsearch.trust.code import allowed_code
 
-Call = Callable[[Sequence[Any]], Any]  # what carries out one batch; a pure function of it
+Call = Callable[[Sequence[Any]], Any]  # what does one batch; a pure function of it
+
+DEATHS = 3  # workers that may die of a call before it is given up
 
 
 @dataclass(frozen=True)
-class Work:
-    """What batches are of, so that another process can carry them out: ``"package.module:function"``, which takes the
-    settings and returns a `Call`; which settings may hold paths, separated by commas, whose files go along; processor
-    threads of a worker; seconds that a batch may take at least (None: by the median); and the code that a worker may
-    import by its name, as this process."""
+class WorkerTask:
+    """What a worker does with batches, in a form that can be sent to it."""
 
-    function: str
+    function: str  # "package.module:function", which takes the settings and returns a `Call`
     settings: JsonObject
-    files: tuple[str, ...] = ()
-    threads: int = 1
-    seconds: float | None = None
-    code: tuple[str, ...] = field(default_factory=allowed_code)
+    files: tuple[str, ...] = ()  # settings that may hold paths, separated by commas, whose files are sent along
+    threads: int = 1  # for rendering, of a worker
+    seconds: float | None = None  # that a batch may take at least; None: by the median of those before
+    code: tuple[str, ...] = field(default_factory=allowed_code)  # that a worker may import by its name, as this process
+    digests: Mapping[str, str] = field(default_factory=dict)  # SHA-256 of the files by path, for workers elsewhere
 
 
 @dataclass(frozen=True, eq=False)
-class Done:
-    """What came of one batch, or of a part of one that workers died of; what the call returned; who carried it out,
-    empty in this process; what machine that is, by its name in `Workforce.machines`, None where it is like this one;
-    and why nothing came back, only of batches of one item."""
+class BatchResult:
+    """What came of a batch, or of one item of a batch of which workers died."""
 
     items: Sequence[Any]
-    value: Any
-    worker: str = ""
-    machine: str | None = None
-    lost: str = ""
+    value: Any  # what the call returned
+    worker: str = ""  # who did it; empty in this process
+    machine: str | None = None  # by its name in `WorkerStats.machines`; None where it is like this one
+    lost: str = ""  # why nothing came back, only of a single item
 
 
 @dataclass
-class Workforce:
-    """How the workers did: those that are ready, at once at most, died, and cannot do the work; batches that were given
-    out again and came back; seconds spent on batches, on getting ready, and ready; machines that are not like this one,
-    by name, and the link of a page that shows the workers."""
+class WorkerStats:
+    """How the workers did."""
 
-    workers: int = 0
-    most: int = 0
-    lost: int = 0
-    refused: int = 0
-    retried: int = 0
-    batches: int = 0
-    busy: float = 0.0
-    loading: float = 0.0
-    alive: float = 0.0
-    machines: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    link: str = ""
+    workers: int = 0  # that are there
+    most: int = 0  # that had work at once, at most
+    lost: int = 0  # that died
+    refused: int = 0  # that cannot do it
+    retried: int = 0  # batches that were given out again
+    batches: int = 0  # that came back
+    busy: float = 0.0  # seconds that workers were at batches
+    loading: float = 0.0  # seconds that they loaded scenes and models
+    alive: float = 0.0  # seconds that they were there, those of loading left out
+    machines: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # that are not like this one, by name
 
     @property
     def told(self) -> dict[str, float | str]:
+        """The same, beside a progress bar."""
         counts = {"lost": self.lost, "retried": self.retried}
         return {"workers": self.workers, **{name: count for name, count in counts.items() if count}}
 
 
-class Executor(Protocol):
-    """Carries out batches."""
+class Workers(Protocol):
+    """Does batches."""
 
     @property
-    def facts(self) -> Workforce | None:
+    def facts(self) -> WorkerStats | None:
         """How the workers do; None where there are none."""
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
-        """Carry out batches, and yield what comes of them, in any order, each once; an AdvsearchError is what one
-        raises, or that nobody can. Only a few are taken from `batches` before their results are asked for. Where nobody
-        goes on asking, what is under way comes to nothing, and other batches may follow."""
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
+        """Do batches, and yield what comes of them, in any order, each once.
+
+        Only as many are taken from `batches` before their results are asked for as there are workers. Raises an
+        AdvsearchError that a batch raises, or ClusterError where there is nobody to do it."""
 
 
 class InProcess:
-    """Carries out one batch after the other in this process."""
+    """Does one batch after the other in this process."""
 
-    facts: Workforce | None = None
+    facts: WorkerStats | None = None
 
     def __init__(self, call: Call) -> None:
         self._call = call
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
-        """See `Executor.results`; they come in order."""
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
+        """See `Workers.results`; they come in order."""
         for items in batches:
-            yield Done(items, self._call(items))
+            yield BatchResult(items, self._call(items))
 
 
 class WorkerDiedError(Exception):
-    """What the future of a call ends with whose worker has gone."""
+    """What a future ends with where `DEATHS` workers died of its call."""
 
 
-class SchedulerGoneError(Exception):
-    """The scheduler of a pool has gone, and all workers and calls with it."""
+class WorkerExecutor(Executor):
+    """An executor that gives a call to another worker where one dies of it.
 
-
-class Pool(Protocol):
-    """Workers, each of which does one call at a time."""
+    A future ends with a WorkerDiedError where `DEATHS` died; with a BrokenExecutor or cancelled where the way to the
+    workers was lost, so that the call has to be submitted again."""
 
     where: str  # what it is, in a user's words
+    stats: WorkerStats
 
-    link: str  # of a page that shows the workers; empty where there is none
-
-    @property
-    def ended(self) -> SimpleQueue[Future[Any]]:
-        """Futures of calls that have ended, put there by who submitted them."""
-
-    def workers(self) -> Collection[str]:
-        """Return the addresses of the workers that are there. Raises SchedulerGoneError."""
-
-    def submit(self, worker: str, function: Callable[..., Any], *args: Any) -> Future[Any]:
-        """Have a worker call a function of a module. The future ends with a WorkerDiedError or never if it dies."""
-
-    def restart(self, worker: str) -> None:
-        """End a worker that does not answer; another may stand in its place, at another address."""
-
-    def reconnect(self) -> None:
-        """Find the scheduler again, or start another. Raises ClusterError where there is none."""
-
-    def close(self) -> None:
-        """Let the workers go, those that were started for this pool for ever."""
+    @abstractmethod
+    def count_workers(self) -> int:
+        """Return how many calls can be under way now. Raises ClusterError where there has been no worker for long."""

@@ -1,9 +1,10 @@
-"""What runs on a worker: it gets ready for a work once, then carries out batches. Errors go back as values, as they may
-not survive being pickled. Files that a work needs are sent to who has not got them; with a mesh goes its folder,
-files in it and below of the kinds that a scene consists of."""
+"""What runs on a worker: it loads a task with its first batch. Errors go back as values, as they may not survive being
+pickled. Files that a task needs are sent to workers that lack them; with a mesh goes its folder, files in it and below
+of the kinds that a scene consists of."""
 
 from __future__ import annotations
 
+import faulthandler
 import hashlib
 import json
 import os
@@ -15,20 +16,24 @@ import tempfile
 import threading
 import time
 import traceback
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from enum import Enum, auto
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
 from advsearch import threads  # before torch: it sets how OpenMP waits
-from advsearch.cluster import Call, Work
+from advsearch.cluster import Call, WorkerTask
 from advsearch.errors import AdvsearchError, EnvironmentSetupError, InputError, StorageError
 from advsearch.files import split_paths
-from advsearch.registry import allow_code, imported
+from advsearch.registry import imported
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
+from advsearch.trust.code import allow_code
 
 _CPU_INFO = Path("/proc/cpuinfo")
 PACKAGES = ("mitsuba", "drjit", "torch", "numpy")  # whose versions decide last bits
@@ -83,22 +88,14 @@ PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff")
 LARGEST = 1 << 30
 
 
-@dataclass(frozen=True)
-class Files:
-    """The files that a work's settings name, and those beside them: digests by path, and what is in them, empty where
-    they are not sent."""
-
-    digests: Mapping[str, str]
-    contents: Mapping[str, bytes]
-
-
-class MissingError(Exception):
+class MissingFilesError(Exception):
     """A file is neither where the settings say nor among those that were sent before."""
 
 
-def read_files(work: Work) -> Files:
+def read_files(task: WorkerTask) -> dict[str, bytes]:
+    """Read the files that a task's settings name, and those beside them, by their paths."""
     contents: dict[str, bytes] = {}
-    for value in map(work.settings.get, work.files):
+    for value in map(task.settings.get, task.files):
         for part in _split(value) if isinstance(value, str) else ():
             path = Path(part)
             if path.is_absolute() and path.is_file():
@@ -112,30 +109,44 @@ def read_files(work: Work) -> Files:
             f"cluster: the files of the scene and the model have {size >> 20} MiB, and {LARGEST >> 20} can be "
             "sent; put them in a folder that all workers see, each under the same path"
         )
-    return Files({path: hashlib.sha256(data).hexdigest() for path, data in contents.items()}, contents)
+    return contents
 
 
-def write_files(work: Work, files: Files, folder: Path) -> Work:
-    """Return the work with the paths that hold here: its own where all its files are here, or else those of copies in
-    a folder of their digests, into which what was sent is written. Raises MissingError."""
-    if all(_is(Path(path), digest) for path, digest in files.digests.items()):
-        return work
-    whole = hashlib.sha256(json.dumps(sorted(files.digests.items())).encode()).hexdigest()[:32]
-    here = {path: folder / whole / Path(path).relative_to(Path(path).anchor) for path in files.digests}
-    for name, data in files.contents.items():
-        here[name].parent.mkdir(parents=True, exist_ok=True)
-        part = here[name].with_name(f"{here[name].name}.part-{os.getpid()}")  # it is whole, or not there
+def file_digests(contents: Mapping[str, bytes]) -> dict[str, str]:
+    return {path: hashlib.sha256(data).hexdigest() for path, data in contents.items()}
+
+
+def sent_paths(digests: Mapping[str, str], folder: Path) -> dict[str, Path]:
+    """Return where files that are sent stand below a folder, by their paths; each set of files has its own."""
+    name = hashlib.sha256(json.dumps(sorted(digests.items())).encode()).hexdigest()[:32]
+    return {path: folder / name / Path(path).relative_to(Path(path).anchor) for path in digests}
+
+
+def write_files(contents: Mapping[str, bytes], folder: Path) -> None:
+    """Write files that were sent, each whole or not at all."""
+    paths = sent_paths(file_digests(contents), folder)
+    for name, data in contents.items():
+        paths[name].parent.mkdir(parents=True, exist_ok=True)
+        part = paths[name].with_name(f"{paths[name].name}.part-{os.getpid()}")
         part.write_bytes(data)
-        part.replace(here[name])
-    for path, digest in files.digests.items():
+        part.replace(paths[name])
+
+
+def find_files(task: WorkerTask, folder: Path) -> WorkerTask:
+    """Return the task with paths that hold here: its own where all its files are here, or else those below a folder to
+    which they were sent. Raises MissingFilesError."""
+    if all(_is(Path(path), digest) for path, digest in task.digests.items()):
+        return task
+    here = sent_paths(task.digests, folder)
+    for path, digest in task.digests.items():
         if not _is(here[path], digest):
-            raise MissingError(path)
-    settings = dict(work.settings)
-    for name in work.files:
+            raise MissingFilesError(path)
+    settings = dict(task.settings)
+    for name in task.files:
         value = settings.get(name)
         if isinstance(value, str):
             settings[name] = "".join(str(here.get(part, part)) for part in _split(value))
-    return replace(work, settings=settings)
+    return replace(task, settings=settings)
 
 
 def _is(path: Path, digest: str) -> bool:
@@ -151,69 +162,99 @@ def _split(value: str) -> Iterator[str]:
         yield from ("+", *second) if second else (mark + inner,)
 
 
-MOST_LOADED = 2  # works that a worker holds; the one that was not used for longest goes
+MAX_LOADED = 2  # tasks that a worker keeps loaded; the one that was not used for longest goes
+LOAD_DEADLINE = 900.0  # seconds that loading may take, and a batch before there is a median
 KERNELS, INPUTS = "kernels", "inputs"  # folders below the machine's own: Dr.Jit's kernels, and files that were sent
 
-_known: dict[str, Work] = {}
+_loaded: OrderedDict[str, Call] = OrderedDict()
 _one_at_a_time = threading.Lock()
 
 
-class Ready(NamedTuple):
-    machine: MachineInfo
-    seconds: float
+class Failure(Enum):
+    """Why a worker has no result."""
+
+    UNFIT = auto()  # another worker may do it
+    MISSING_FILES = auto()  # it has not got the files of the task
+    INPUT = auto()  # a user can mend it
+    BUG = auto()  # the error is a traceback
 
 
-class Carried(NamedTuple):
-    value: Any
-    seconds: float
+@dataclass(frozen=True)
+class Reply:
+    """What a worker says of a batch."""
+
+    value: Any = None
+    seconds: float = 0.0  # that the batch took, and that loading took before it
+    loading: float = 0.0
+    machine: MachineInfo = field(default_factory=dict)
+    worker: str = ""
+    failure: Failure | None = None
+    error: str = ""
 
 
-class Failure(NamedTuple):
-    """Something went wrong, as a user reads it: another worker may do it (`unfit`), the worker is not ready (any more),
-    or it lacks files. What is a bug has a trace."""
+def run_batch(task: WorkerTask, items: Sequence[Any], deadline: float) -> Reply:
+    """Do a batch of a task, which is loaded before unless it is already.
 
-    text: str
-    unfit: bool = False
-    forgotten: bool = False
-    missing: bool = False
-    trace: str = ""
-
-
-def prepare(key: str, work: Work, files: Files, asked: str) -> Ready | Failure:
-    """Get ready for a work that a version of advsearch asks for."""
-    begun = time.perf_counter()
-    if version() != asked:
-        return Failure(f"it has advsearch {version()}, and {asked} asks; install the same on both", unfit=True)
+    After `deadline` seconds, or `LOAD_DEADLINE` of loading, the process ends, whatever native code it hangs in, and
+    writes to its error output where that was."""
+    worker = f"{platform.node()}, process {os.getpid()}"
     try:
         with _one_at_a_time:
-            if key not in _known:
-                own = own_folder()
-                if "DRJIT_CACHE_DIR" not in os.environ:
-                    (own / KERNELS).mkdir(exist_ok=True)
-                    os.environ["DRJIT_CACHE_DIR"] = str(own / KERNELS)
-                this_machine()
-                allow_code(*work.code)
-                _known[key] = write_files(work, files, own / INPUTS)
-            _call_of(key)
-            machine = this_machine()
-    except MissingError as error:
-        return Failure(f"it lacks {error}", missing=True)
-    except Exception as error:
-        return _failure(error, unfit=isinstance(error, (EnvironmentSetupError, StorageError, OSError, ImportError)))
-    return Ready(machine, time.perf_counter() - begun)
+            start = time.perf_counter()
+            with ended_after(LOAD_DEADLINE):
+                call = load_task(task)
+            loading = time.perf_counter() - start
+            with ended_after(deadline):
+                value = call(items)
+            seconds = time.perf_counter() - start - loading
+        return Reply(value, seconds, loading, this_machine(), worker)
+    except MissingFilesError as error:
+        return Reply(worker=worker, failure=Failure.MISSING_FILES, error=f"it lacks {error}")
+    except (EnvironmentSetupError, StorageError) as error:
+        return Reply(worker=worker, failure=Failure.UNFIT, error=str(error))
+    except AdvsearchError as error:
+        return Reply(worker=worker, failure=Failure.INPUT, error=str(error))
+    except (OSError, ImportError) as error:
+        return Reply(worker=worker, failure=Failure.UNFIT, error=f"{type(error).__name__}: {error}")
+    except Exception:
+        return Reply(worker=worker, failure=Failure.BUG, error=traceback.format_exc())
 
 
-def carry_out_batch(key: str, items: Sequence[Any]) -> Carried | Failure:
-    """Carry out a batch of a work that this worker is ready for."""
-    begun = time.perf_counter()
+@contextmanager
+def ended_after(seconds: float) -> Iterator[None]:
+    """End this process if the block takes longer."""
+    faulthandler.dump_traceback_later(seconds, exit=True, file=2)
     try:
-        with _one_at_a_time:
-            if key not in _known:
-                return Failure("it is not ready", forgotten=True)
-            value = _call_of(key)(items)
-    except Exception as error:
-        return _failure(error, unfit=isinstance(error, (OSError, StorageError)))
-    return Carried(value, time.perf_counter() - begun)
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+def load_task(task: WorkerTask) -> Call:
+    """Return what does batches of a task. Raises MissingFilesError."""
+    key = task_key(task)
+    if key in _loaded:
+        _loaded.move_to_end(key)
+        return _loaded[key]
+    folder = own_folder()
+    if "DRJIT_CACHE_DIR" not in os.environ:
+        (folder / KERNELS).mkdir(exist_ok=True)
+        os.environ["DRJIT_CACHE_DIR"] = str(folder / KERNELS)
+    this_machine()  # without libLLVM nothing is loaded
+    allow_code(*task.code)
+    task = find_files(task, folder / INPUTS)
+    threads.configure(task.threads)
+    make: Callable[[Any], Call] = imported(task.function)
+    while len(_loaded) >= MAX_LOADED:
+        _loaded.popitem(last=False)
+    _loaded[key] = make(task.settings)
+    return _loaded[key]
+
+
+def task_key(task: WorkerTask) -> str:
+    """Return what tells a task from others."""
+    described = [task.function, task.settings, task.threads, task.code, sorted(task.digests.items())]
+    return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()
 
 
 def own_folder() -> Path:
@@ -223,20 +264,6 @@ def own_folder() -> Path:
     facts = folder.lstat()
     mine = stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid() and not facts.st_mode & 0o022
     return folder if mine else Path(tempfile.mkdtemp(prefix="advsearch-"))
-
-
-@lru_cache(MOST_LOADED)
-def _call_of(key: str) -> Call:
-    work = _known[key]
-    threads.configure(work.threads)
-    make: Callable[[Any], Call] = imported(work.function)
-    return make(work.settings)
-
-
-def _failure(error: Exception, *, unfit: bool) -> Failure:
-    ours = isinstance(error, AdvsearchError) or unfit
-    text = str(error) if isinstance(error, AdvsearchError) else f"{type(error).__name__}: {error}"
-    return Failure(text, unfit, trace="" if ours else traceback.format_exc())
 
 
 SERVING = "ADVSEARCH_WORKER"  # environment variable of a process that `serve`s

@@ -24,6 +24,7 @@ from advsearch.scene.camera_entries import PRESETS
 from advsearch.scene.camera_model import COEFFICIENTS, NUMBERS, OF_KIND, CameraModel, pinhole
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import STEEPEST, affine, camera_to_world, framing_distance, middle
+from advsearch.scene.grounds import is_against_traffic, traffic_remark
 from advsearch.scene.settings import CAMERA, ORBIT, ORBIT_CAMERA, moving
 
 ROAD_USERS = (0.5, 4.0)  # metres above the road from which vehicles are seen: from a bumper to the roof of a lorry
@@ -65,6 +66,8 @@ class CameraControl(Control):
                 raise InputError(
                     f"`controls` {self.name}: {first} and {second} say the same thing; leave one of them out"
                 )
+        if "azimuth" in self.specs and self._drives_against_traffic(scene):
+            scene = replace(scene, remarks=(*scene.remarks, traffic_remark(scene)))
         wanted = "aperture" in self.specs or "focus" in self.specs
         if wanted and self._shifted:
             raise InputError(
@@ -87,6 +90,13 @@ class CameraControl(Control):
                 whose = f"the lens of `camera={model.name}`" if model.name else "a lens with distortion, or raindrops"
                 raise InputError(f"`controls` {self.name}: {name} is not supported with {whose}; leave one of them out")
         return scene
+
+    def _drives_against_traffic(self, scene: SceneDescription) -> bool:
+        """Whether the camera does so at the begin, the middle and the end of all its ranges."""
+        control = self.bind(scene)
+        configurations = (torch.full_like(control.start, value) for value in (0.0, 0.5, 1.0))
+        poses = [control.inputs(u)["camera.to_world"].detach().double().numpy() for u in configurations]
+        return all(is_against_traffic(scene, pose) for pose in poses)
 
     @property
     def _shifted(self) -> bool:
@@ -167,7 +177,8 @@ class CameraControl(Control):
         return self.scene
 
     def _orbit(self, values: Values, distance: Tensor) -> Tensor:
-        azimuth, elevation, roll = (torch.deg2rad(values[name]) for name in ("azimuth", "elevation", "roll"))
+        azimuth = torch.deg2rad(self.scene.azimuth_zero + values["azimuth"])
+        elevation, roll = torch.deg2rad(values["elevation"]), torch.deg2rad(values["roll"])
         keeps_height = "height" in self.specs  # above the ground, so that the elevation follows
         if not {"elevation", "height"} & self.specs.keys():
             searched = any(slot.width for slot in self.slots if slot.parameter.name == "height")

@@ -25,7 +25,6 @@ from advsearch.controls.base import Choice, Control, Value, Values, measure, nam
 from advsearch.controls.support.meshes import sphere
 from advsearch.controls.support.visibility import SURROUNDINGS, camera_in, put_away
 from advsearch.errors import InputError
-from advsearch.files import reading
 from advsearch.scene import library, silhouettes
 from advsearch.scene.assets import Doubles, Material, Mesh, ObjectAsset, normalised
 from advsearch.scene.camera_model import CameraModel
@@ -34,6 +33,7 @@ from advsearch.scene.geometry import affine, camera_to_world, object_to_world, r
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import ORBIT, moving
+from advsearch.trust.stored_files import reading
 
 _moving = partial(moving, ORBIT)
 

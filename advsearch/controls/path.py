@@ -26,7 +26,7 @@ from advsearch.controls.base import WAY, Choice, Control, Parameter, Value, Valu
 from advsearch.controls.ranges import OneOf, Spec, is_number
 from advsearch.controls.support.rotations import euler
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import PATH_ENDINGS, read_text
+from advsearch.files import PATH_ENDINGS
 from advsearch.options import rounded
 from advsearch.scene.assets import Doubles
 from advsearch.scene.description import SceneDescription
@@ -43,6 +43,7 @@ from advsearch.scene.pose_files import (
 )
 from advsearch.scene.settings import GEOMETRIC, ORBIT, ORBIT_CAMERA, moving
 from advsearch.scene.skeleton import entries_of_turn
+from advsearch.trust.stored_files import read_text
 
 APPROACH, PASS, TURN = "approach", "pass", "orbit"
 PATHS = (APPROACH, PASS, TURN)
@@ -249,7 +250,7 @@ class PathControl(Control):
         if assumed:
             listed = ", ".join(f"{name} {value}" for name, value in assumed.items())
             notes.append(
-                f"{path}: {trajectory.format.value} does not state everything. Assumed: {listed}. If that is wrong, "
+                f"{path}: not everything is stated by {trajectory.format.value}. Assumed: {listed}. If that is wrong, "
                 f"say {', '.join(assumed)} of the control path; with axes none the camera looks at the object."
             )
         quaternions = None
@@ -355,11 +356,20 @@ class PathControl(Control):
         return inputs
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        time, start, ways = values["time"], start_of(self.scene, values["time"].device), self._ways(values)
+        unit = "object sizes" if self.scene.object.metres is None else "metres"
+        return {"distance": measure(float(self._distance(self._ways(values), values["time"])), unit)}
+
+    def distances(self, times: Tensor) -> Tensor:
+        """Return the distances (ways, n) of the camera from the object on each of the paths at times (n,), in the unit
+        of `measured`."""
+        return torch.stack([self._distance(ways, times).expand(times.shape) for ways in self._paths])
+
+    def _distance(self, ways: Ways, time: Tensor) -> Tensor:
+        start = start_of(self.scene, time.device)
         shift, _ = self._object(ways, start, time)
         away = self._camera(ways, start, time, shift)[0] - start.middle - shift
-        unit = "object sizes" if self.scene.object.metres is None else "metres"
-        return {"distance": measure(float(away.norm()) * self.scene.metres, unit)}
+        distance: Tensor = away.norm(dim=-1).double() * self.scene.metres
+        return distance
 
     def _ways(self, values: Values) -> Ways:
         return self._paths[int(values[WAY])] if WAY in values else self._paths[0]

@@ -19,11 +19,11 @@ from advsearch.attacks.evaluation import Query, WhichGradient
 from advsearch.attacks.policies.sampling import to_domain
 from advsearch.engine.acceptance import ComparedView
 from advsearch.engine.transport import PredictedSearch
-from advsearch.files import scaled
 from advsearch.runs.results import BankOfConditions
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.predictor import MOST_BYTES
 from advsearch.scene.transport.matrix import LinearRenderer, Tick
+from advsearch.trust.stored_files import scaled
 
 FIRST = 8  # conditions in the bank at first, in what an evaluation draws
 GROWTH = 4  # an evaluation adds a condition for so many that it draws, while the bank grows

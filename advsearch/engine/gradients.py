@@ -325,7 +325,6 @@ class Bench:
             stage: is told what begins and of how many steps.
         """
 
-        # what is kept has names, so that a run that an older version began goes on
         def referred(probe: Probe, spp: int) -> dict[str, Any]:
             bench = replace(self, spp=spp)
             return bench.reference(probe, repeats=seeds_of_reference, factors=reference_factors)._asdict()

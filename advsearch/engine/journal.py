@@ -24,7 +24,7 @@ from torch import Tensor
 
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.cluster import Call, Executor, Workforce
+from advsearch.cluster import Call, Workers, WorkerStats
 from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import LOST, judged, judgement_of, trial_row
 from advsearch.errors import ClusterError, InputError
@@ -55,7 +55,7 @@ class Shared:
     here. Its `name` tells it from others that workers hold. A sweep asks scenes, and has none."""
 
     own: Problem | None
-    executor: Executor | None = None
+    executor: Workers | None = None
     name: ProblemKey = ""
 
     @property
@@ -65,7 +65,7 @@ class Shared:
         return self.own
 
     @property
-    def facts(self) -> Workforce | None:
+    def facts(self) -> WorkerStats | None:
         return None if self.executor is None else self.executor.facts
 
     @property
@@ -93,7 +93,7 @@ class Shared:
                     turn += 1
 
 
-def worker_call(named: Callable[[ProblemKey], Answerer]) -> Call:
+def worker_call(named: Callable[[Any], Answerer]) -> Call:
     """Return what answers queries that were sent: what a worker does."""
 
     def call(sent: Sequence[Sent]) -> list[Evaluation]:

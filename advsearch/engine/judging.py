@@ -30,7 +30,6 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.features import features_of
 from advsearch.options import Value, check_takes
-from advsearch.registry import check_import, current_directory_importable
 from advsearch.report.wording import seen_text
 from advsearch.runs.export import AFTER, OWN
 from advsearch.runs.results import PrintTerms
@@ -41,6 +40,7 @@ from advsearch.scene.things import ALL
 from advsearch.tasks import Facts, Judgement, Task
 from advsearch.tasks.base import Output, Truth, mean
 from advsearch.tasks.together import Ensemble, Outputs, Together, of_each
+from advsearch.trust.code import check_import, current_directory_importable
 
 Metric = Callable[[Tensor, Any, Any], Any]
 """f(image, output, truth), which returns a number, or numbers by name. Where one name is right, `truth` is its index, a

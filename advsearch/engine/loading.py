@@ -20,9 +20,7 @@ from advsearch.calls import helped
 from advsearch.controls import CONTROLS, Control, Space, gathered, make_control, make_space, settings_by_name
 from advsearch.distributions import OwnQuantiles, as_setting
 from advsearch.errors import InputError
-from advsearch.models.guards import plainly
 from advsearch.options import things_as_text, told
-from advsearch.registry import names_code
 from advsearch.scene import settings
 from advsearch.scene.assembly import Assembly, Motion
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
@@ -44,6 +42,8 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA, Given
 from advsearch.settings import as_python, read_controls
+from advsearch.trust.code import names_code
+from advsearch.trust.foreign_code import plainly
 
 Controls = str | Control | Sequence[str | Control] | Mapping[str, object]
 """One control or several, by name or instance; a mapping gives each name its settings or
@@ -153,8 +153,9 @@ class Scene:
 @plainly()
 def load_scene(
     object: str | Path | ObjectAsset, environment: str | Path | EnvironmentAsset | None = None, *,
-    scene: str | Path | Mapping[str, object] | None = None, up: str | None = None, size: float | None = None,
-    unit: str | None = None, settings: Given | None = None, camera: str | None = None, texture: Texture | None = None,
+    scene: str | Path | Mapping[str, object] | None = None, up: str | None = None, facing: str | None = None,
+    size: float | None = None, unit: str | None = None, settings: Given | None = None, camera: str | None = None,
+    texture: Texture | None = None,
     things: str | Mapping[str, object] | Sequence[str | Mapping[str, object]] | None = None,
 ) -> Scene:  # fmt: skip
     """Load a scene.
@@ -165,6 +166,8 @@ def load_scene(
         scene: the file or, of Mitsuba, the dictionary (`mi.cornell_box()`) in which `object` is a node or the id of a
             shape; a file may as well be written before it: "scene.glb#chair", "box.xml#large-box".
         up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.
+        facing: the axis of a mesh file that its front faces, "+x", "-x", "+y", "-y", "+z" or "-z"; by default what its
+            format says: +z of glTF and VRM 1, -z of VRM 0, and +x of others. It is turned towards +x.
         size: of the object, its longest side in metres, 1e-4 to 1e4. Distances of the camera, paths of files and the
             height of a photograph are in metres where the size of the object is known, and in object sizes elsewhere.
         unit: of the coordinates of the object's file, "mm", "cm", "m" or "in", which gives it its size; by default
@@ -187,8 +190,8 @@ def load_scene(
         raise InputError(f"object: expected the name of a node or shape of the scene, got {object!r}")
     plugins = scene if isinstance(scene, Mapping) else None
     described = describe(
-        object if scene is None or plugins is not None else f"{scene}#{object}", environment, up=up, size=size,
-        given=None if settings is None else as_python(settings), unit=unit, plugins=plugins,
+        object if scene is None or plugins is not None else f"{scene}#{object}", environment, up=up, facing=facing,
+        size=size, given=None if settings is None else as_python(settings), unit=unit, plugins=plugins,
         things=things_as_text(things),
     )  # fmt: skip
     named = all(given is None or isinstance(given, (str, Path)) for given in (object, environment))
@@ -204,7 +207,7 @@ def scene_as_settings(scene: Scene) -> dict[str, Any]:
     return {
         "object": own.object_name,
         "environment": own.environment_name,
-        **{name: getattr(own, name) for name in ("up", "size", "unit")},
+        **{name: getattr(own, name) for name in ("up", "facing", "size", "unit")},
         "camera": own.rig_spec if own.rig else named,
         "things": own.things_spec or None,
         "set": own.given_values,

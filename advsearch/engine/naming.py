@@ -20,13 +20,13 @@ from advsearch.engine.loading import CONTROL, MODEL, Controls, Scene, as_control
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.guards import plainly
 from advsearch.models.loading import named_code
 from advsearch.scene.rig import read_rig
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
 from advsearch.tasks import Task
 from advsearch.tasks.together import Together, together
+from advsearch.trust.foreign_code import plainly
 
 
 def scene_of(config: SceneConfig, name: str | None = None, environment: str | None = None) -> Scene:
@@ -37,7 +37,7 @@ def scene_of(config: SceneConfig, name: str | None = None, environment: str | No
 
 
 def told_of_scene(config: SceneConfig) -> dict[str, Any]:
-    names = ("up", "size", "unit", "camera", "things")
+    names = ("up", "facing", "size", "unit", "camera", "things")
     return {**{name: getattr(config, name) for name in names}, "settings": scene_settings(config)}
 
 
@@ -132,7 +132,7 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
     return names
 
 
-OF_SCENE = ("set", "environment", "up", "size", "unit", "camera", "things", "exposure", "object")
+OF_SCENE = ("set", "environment", "up", "facing", "size", "unit", "camera", "things", "exposure", "object")
 
 
 def check_not_of_scene(settings: Mapping[str, object]) -> None:

@@ -19,12 +19,11 @@ from advsearch.engine.loading import Controls, Scene, Texture, as_controls, fram
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonObject
 from advsearch.models import Model, load_model
-from advsearch.models.guards import plainly
 from advsearch.options import Value
 from advsearch.progress import Watched, watcher
 from advsearch.report.figures import contact_sheet, marked
 from advsearch.report.wording import seen_text
-from advsearch.runs.files import placed_by, png_bytes, write_exr, write_layers, write_png
+from advsearch.runs.files import png_bytes, write_exr, write_layers, write_png
 from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewPredictions
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.formation import SAMPLER, ImageFormation, Surfaces, to_8_bit
@@ -35,6 +34,8 @@ from advsearch.scene.things import ALL
 from advsearch.settings import as_python
 from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, make_task
 from advsearch.tasks.together import each_thing
+from advsearch.trust.foreign_code import plainly
+from advsearch.trust.writing import placed_by
 
 MOST_PREDICTIONS = 5  # predictions of the model that are kept of a picture
 

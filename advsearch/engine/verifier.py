@@ -25,7 +25,7 @@ from advsearch.attacks.trials import (
     margins_of,
     most_samples,
 )
-from advsearch.cluster import Executor
+from advsearch.cluster import Workers
 from advsearch.config import SceneConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
@@ -202,7 +202,7 @@ class Retrials:
 
     def __init__(
         self, conditions: Sequence[RetrialCondition], run: RunDirectory, progress: Progress, *, trials: int, seed: int,
-        executor: Executor | None = None,
+        executor: Workers | None = None,
     ) -> None:  # fmt: skip
         self._progress, self._count, self._seed = progress, trials, seed
         first = Journal(run, Shared(conditions[0].problem))

@@ -12,11 +12,8 @@ import base64
 import hashlib
 import http.client
 import io
-import ipaddress
 import json
 import math
-import os
-import re
 import socket
 import ssl
 import threading
@@ -31,7 +28,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Protocol, TypeAlias
-from urllib.parse import SplitResult, parse_qsl, urlsplit, urlunsplit
+from urllib.parse import urlunsplit
 
 import numpy as np
 import numpy.typing as npt
@@ -39,15 +36,15 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import CodeNotAllowedError, InputError, ModelError, UnknownNameError
-from advsearch.files import parse_json, scaled
 from advsearch.interrupts import INTERRUPTS
 from advsearch.models.model import Model, Preprocessing
 from advsearch.models.source import Purpose
 from advsearch.models.zoo.language import QUESTION, SIDE
 from advsearch.pictures import png_of
-from advsearch.registry import how_to_allow, may_fetch
+from advsearch.trust.code import how_to_allow, may_fetch
+from advsearch.trust.network import KEY, NoRedirect, check_address, is_local, read_key
+from advsearch.trust.stored_files import parse_json, scaled
 
-KEY = "ADVSEARCH_MODEL_KEY"  # the environment variable with the key that is sent as ``Authorization: Bearer``
 CHAT = "/chat/completions"  # how the path of an address ends that is asked as OpenAI's chat is
 
 LIMITS: dict[str, float] = {
@@ -83,8 +80,8 @@ class KeepsAnswers(Protocol):
 
 def load(spec: str, purpose: Purpose) -> Model:
     """Return the model behind an address, which is asked for its names where nobody says them. Raises InputError: only
-    a file names it, or as `checked`; ModelError: it cannot do what it is to be asked, or nobody answers."""
-    address = checked(spec)
+    a file names it, or as `check_address`; ModelError: it cannot do what it is to be asked, or nobody answers."""
+    address = check_address(spec)
     if not may_fetch(spec):
         raise CodeNotAllowedError(
             f"a file names the model {spec}, to which pictures would be sent, and the key in {KEY}; "
@@ -120,40 +117,6 @@ def load(spec: str, purpose: Purpose) -> Model:
     )
 
 
-def checked(spec: str) -> SplitResult:
-    """Return the parts of an address. Raises InputError: it has no host, a secret in it, which would be stored with the
-    run, or the key would go over it unencrypted."""
-    try:
-        address = urlsplit(spec)
-        host, _ = address.hostname, address.port
-    except ValueError as error:
-        raise InputError(f"model {spec!r}: expected an address, http://HOST:PORT/PATH ({error})") from None
-    if not host or not spec.isascii() or not spec.isprintable() or " " in spec:
-        raise InputError(f"model {spec!r}: expected an address, http://HOST:PORT/PATH")
-    secret = [name for name, _ in parse_qsl(address.query) if re.search("key|token|secret|passw|sig|auth", name, re.I)]
-    if "@" in address.netloc or secret:
-        where = f"`{secret[0]}` in the address" if secret else "the user and password in the address"
-        raise InputError(f"model: {where} would be stored with the run; put the key into {KEY} and leave it out there")
-    if _key() and address.scheme == "http" and not is_local(host):
-        raise InputError(f"model {spec}: the key in {KEY} would go there unencrypted; use https, or unset {KEY}")
-    return address
-
-
-def is_local(host: str) -> bool:
-    """Whether a host is this machine."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
-def _key() -> str:
-    key = os.environ.get(KEY, "").strip()
-    if not (key.isascii() and key.isprintable()):  # http.client would show it in its error
-        raise InputError(f"{KEY}: expected a key of printable ASCII characters, got others")
-    return key
-
-
 def limits_of(ask: Mapping[str, float]) -> dict[str, float]:
     """Return every limit, as asked or by default. Raises InputError where a name is unknown, or a number below 0."""
     for name, value in ask.items():
@@ -170,13 +133,6 @@ def limits_of(ask: Mapping[str, float]) -> dict[str, float]:
             "`ask` money: expected a price beside it; give `ask` per_call, or per_million_in and per_million_out"
         )
     return limits
-
-
-class _NoRedirect(urllib.request.HTTPRedirectHandler):
-    """Follows no redirect: what is sent has a key in it."""
-
-    def redirect_request(self, *_: Any) -> None:
-        return None
 
 
 class _Connection(http.client.HTTPConnection):
@@ -458,7 +414,7 @@ class AskedModel:
                     f"sends on to {there}, and pictures and keys are not sent there; give that address if you trust it"
                 )
             elif code in (401, 403):
-                why = f"status {code}: the key in {KEY} {'is not accepted' if _key() else 'is missing'}"
+                why = f"status {code}: the key in {KEY} {'is not accepted' if read_key() else 'is missing'}"
             else:
                 text = error.read(LONGEST_FAILURE).decode(errors="replace")
                 why = f"status {code} {self._clean(str(error.reason))}: {self._clean(text)[:300]}"
@@ -466,12 +422,12 @@ class AskedModel:
         return why, code in BUSY, float(asked_to) if asked_to.isdigit() else 0.0
 
     def _sent(self, body: bytes, end: float, connections: list[_Connection]) -> dict[str, Any]:
-        key = _key()
+        key = read_key()
         headers = {"Content-Type": "application/json", "User-Agent": "advsearch"}
         request = urllib.request.Request(self.url, body, headers)
         if key:
             request.add_unredirected_header("Authorization", f"Bearer {key}")
-        handlers: list[Any] = [_NoRedirect, _Handler(end, connections), _SecureHandler(end, connections)]
+        handlers: list[Any] = [NoRedirect, _Handler(end, connections), _SecureHandler(end, connections)]
         if is_local(request.host.rpartition(":")[0].strip("[]") or request.host):
             handlers.append(urllib.request.ProxyHandler({}))
         parts, size = list[bytes](), 0
@@ -492,7 +448,7 @@ class AskedModel:
 
     def _clean(self, text: str) -> str:
         """What a server says, in one line and without the key, which it may send back."""
-        text = text.replace(_key(), "(key)") if _key() else text
+        text = text.replace(read_key(), "(key)") if read_key() else text
         return " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
 
     def _wrong(self, expected: str, got: str | Mapping[str, Any]) -> ModelError:

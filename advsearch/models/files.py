@@ -21,16 +21,15 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.errors import FileFormatError, ModelError
-from advsearch.files import open_regular
-from advsearch.models import exported
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.archive import LARGEST, Archive, open_archive, refused, rewritten_torchscript
-from advsearch.models.guards import try_torchscript
 from advsearch.models.inputs import SIZE_INPUTS, SIZE_TYPES, EightBitInput
 from advsearch.models.labels import names_in
-from advsearch.models.probe import foreign
 from advsearch.models.source import Source, source_of
-from advsearch.models.zoo.library import library, without_unpickling
+from advsearch.models.zoo.library import library
+from advsearch.trust import exported_programs
+from advsearch.trust.archives import LARGEST, Archive, open_archive, refused, rewritten_torchscript, without_unpickling
+from advsearch.trust.foreign_code import foreign, try_torchscript
+from advsearch.trust.stored_files import open_regular
 
 #: Suffixes that make a name a file even if there is no such file.
 SUFFIXES = (".pt2", ".pt", ".pth", ".ts", ".torchscript", ".bin", ".pkl", ".pickle", ".ckpt", ".safetensors", ".onnx")
@@ -75,7 +74,7 @@ def load_file(path: Path) -> Source:
                     warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=kind)
                 module = torch.jit.load(checked, map_location="cpu")
             return source_of(module, path.stem)
-        checked = exported.rewritten(archive)
+        checked = exported_programs.rewritten(archive)
         logger = logging.getLogger("torch.export")  # prints a traceback of what is refused with a message anyway
         with _damaged(path, "torch.export"), without_unpickling(), ExitStack() as stack:
             stack.callback(logger.setLevel, logger.level)

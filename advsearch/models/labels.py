@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.errors import FileFormatError, InputError, resembling
-from advsearch.files import parse_json, read_text
+from advsearch.trust.stored_files import parse_json, read_text
 
 PROMPT = "a photo of a {}"  # the text that a name is put into where nothing else is said
 LARGEST = 16 << 20  # bytes of a label file

@@ -16,13 +16,13 @@ from torch import Tensor, nn
 from advsearch.catalog import list_built_ins
 from advsearch.errors import InputError, ModelError, UnknownNameError, resembling
 from advsearch.models import address, files, reference
-from advsearch.models.guards import WithState, called_under, plainly, turned_by_code
-from advsearch.models.inputs import EightBitInput, WithImageSize
+from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
 from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
 from advsearch.models.model import PRESETS, Model, Preprocessing, Read
 from advsearch.models.probe import probe
 from advsearch.models.source import Purpose, Source, load_callable, source_of, split_weights
 from advsearch.registry import Registry
+from advsearch.trust.foreign_code import called_under, plainly, turned_by_code
 
 DEFAULT_INPUT_SIZE = (224, 224)  # where neither the model nor the caller says
 

@@ -5,20 +5,20 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from advsearch import files
-from advsearch.errors import AdvsearchError, ModelError
+from advsearch.errors import ModelError
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.guards import TookTooLong, WithState, within
-from advsearch.models.inputs import EightBitInput, WithImageSize
+from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
 from advsearch.models.labels import fitting_labels
 from advsearch.models.model import Detaching, Model, logits_of, read_by, tensors_in, warn
+from advsearch.trust.foreign_code import TookTooLong, first_line, within
+from advsearch.trust.stored_files import FACTOR, scaled
 
 PROBABILITY_TOLERANCE = 1e-3  # rows that are non-negative and sum to 1 within this are taken for probabilities
 PERCENT_TOLERANCE = 5e-3  # rows that are non-negative and sum to 100 within this share of it, for percentages
@@ -73,10 +73,10 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
             or no gradient reaches the image.
     """
     (height, width), count = model.input_size, max(model.batch_limits[0], 1)
-    if count * height * width > files.scaled(LARGEST):
+    if count * height * width > scaled(LARGEST):
         raise ModelError(
             f"model {model.name}: takes {count:,} images of {height:,} x {width:,} pixels at once, expected at most "
-            f"{files.scaled(LARGEST):,} pixels; if you trust it, {files.FACTOR}=10 in the environment allows ten times "
+            f"{scaled(LARGEST):,} pixels; if you trust it, {FACTOR}=10 in the environment allows ten times "
             "as many"
         )
     grey = torch.full((1, height, width, 3), 0.5)
@@ -421,23 +421,3 @@ def _choices(model: Model, images: Tensor) -> str:
         choices.append((tensor.shape, columns[(columns == columns.round()).all(dim=1)].tolist()))
     mappings = (output for output in outputs if isinstance(output, Mapping))
     return str(choices + [text for mapping in mappings for text in mapping.values() if type(text) is str])
-
-
-def first_line(error: BaseException) -> str:
-    """Return a foreign error as one short line."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    lines = ["".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line) for line in lines[:1]]
-    text = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
-    return text if len(text) <= 300 else text[:297] + "..."
-
-
-@contextmanager
-def foreign(what: str, kind: type[AdvsearchError] = ModelError) -> Iterator[None]:
-    """Turn what code of others raises inside the block, which may be anything, into an error: what failed, and the
-    foreign error. One of ours is left as it is."""
-    try:
-        yield
-    except AdvsearchError:
-        raise
-    except Exception as error:
-        raise kind(f"{what} ({first_line(error)})") from error

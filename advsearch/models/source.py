@@ -25,12 +25,13 @@ from torch import nn
 from torch.nn.parameter import is_lazy
 
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError, resembling
-from advsearch.files import open_regular
-from advsearch.models.archive import LARGEST
 from advsearch.models.inputs import takes_image_size
 from advsearch.models.model import CPU, GIVEN_BY, Model, Triple, warn
-from advsearch.models.probe import PROGRAMS, first_line
-from advsearch.registry import check_import, current_directory_importable
+from advsearch.models.probe import PROGRAMS
+from advsearch.trust.archives import LARGEST
+from advsearch.trust.code import check_import, current_directory_importable
+from advsearch.trust.foreign_code import first_line
+from advsearch.trust.stored_files import open_regular
 
 
 @dataclass(frozen=True)
@@ -195,7 +196,7 @@ def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     without arguments (a function, or a class of modules). `libraries` may stand before the colon too: a module that
     there is not may be one of them, misspelt. Raises ModelError: it cannot be imported, raises, returns something else,
     or the weights do not fit; UnknownNameError: the module has no such attribute; near matches are named; InputError:
-    it must not be imported (`registry.check_import`)."""
+    it must not be imported (`trust.code.check_import`)."""
     target, weights = split_weights(spec)
     check_import(target)
     module_name, _, attribute = target.partition(":")

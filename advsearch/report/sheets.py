@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageCms
 
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import read_bytes
+from advsearch.trust.stored_files import read_bytes
 
 Bytes = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]

@@ -217,6 +217,9 @@ class Extent(Fields):
     count: int
     total: int = Field(alias="of")
     interval: Interval = Field(description="95 %, of the share")
+    share: float | None = Field(
+        default=None, description="the mean over draws of the share of each, where some share one; absent elsewhere"
+    )
 
 
 class Claim(Fields):
@@ -276,12 +279,16 @@ def extent_of(what: str, rate: VerifiedRate | None) -> Extent | None:
     return None if rate is None else counted(what, rate.successes, rate.trials, rate.interval)
 
 
-def counted(what: str, count: int, total: int, interval: Interval | None) -> Extent:
-    return Extent(what=what, count=count, total=total, interval=interval or (0.0, 1.0))
+def counted(what: str, count: int, total: int, interval: Interval | None, share: float | None = None) -> Extent:
+    """Return a count with the interval of its share, which is `share` where that is not count over total."""
+    own_share = share if total and share != count / total else None
+    return Extent(what=what, count=count, total=total, interval=interval or (0.0, 1.0), share=own_share)
 
 
 def share_text(extent: Extent) -> str:
-    share = percent(extent.count / extent.total) if extent.total else "none"
+    share = "none"
+    if extent.total:
+        share = percent(extent.count / extent.total if extent.share is None else extent.share)
     return f"{extent.count} of {extent.total} ({share}, 95 % interval {wording.interval_text(extent.interval)})"
 
 

@@ -93,12 +93,27 @@ def percent_number(share: float, most: int = MOST_DECIMALS) -> str:
     return f"under {least:.{decimals}f}" if text == "0" else f"over {100.0 - least:.{decimals}f}"
 
 
-def share_of_text(count: int, total: int, interval: tuple[float, float]) -> str:
-    """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
+def share_of_text(count: int, total: int, interval: tuple[float, float], share: float | None = None) -> str:
+    """Return a share with its interval and what it is of: ``12 % (9 to 16) of 340``; the share is count over total
+    unless another one is given."""
     if not total:
         return "none of 0"
     low, high = map(percent_number, interval)
-    return f"{percent(count / total)} ({low} to {high}) of {total:,}"
+    return f"{percent(count / total if share is None else share)} ({low} to {high}) of {total:,}"
+
+
+def repeats_remark(name: str, repeats: int, units: int) -> str:
+    """Return what is said of a sweep in which nothing is drawn, with so many `repeats` of each of its units, which are
+    called by a `name`."""
+    if units == 1:
+        return (
+            f"Nothing is drawn: all {repeats} repeats are of one {name} and differ in noise alone. The shares are of "
+            f"this one {name}; nothing is shown of others, so that there is no interval over {name}s."
+        )
+    return (
+        f"Nothing is drawn: the {repeats} repeats of each {name} differ in noise alone and count as one. Intervals "
+        f"are over {units} {name}s."
+    )
 
 
 def with_article(name: str) -> str:

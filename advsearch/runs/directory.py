@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import itertools
 import json
 import os
@@ -15,12 +14,21 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
-from advsearch.files import open_regular
 from advsearch.runs import files, store, summary
-from advsearch.runs.files import PART, storage_errors, write_bytes, write_text
 from advsearch.runs.trackers import Tracker, check_tracker
 from advsearch.settings import HEADER, PythonOnly, settings
-from advsearch.yaml_text import LARGEST
+from advsearch.trust.stored_files import open_regular
+from advsearch.trust.writing import (
+    LOCK,
+    PART,
+    RunLock,
+    check_no_links,
+    check_there,
+    storage_errors,
+    write_bytes,
+    write_text,
+)
+from advsearch.trust.yaml_text import LARGEST
 
 if TYPE_CHECKING:
     from advsearch.runs.results import Result
@@ -57,7 +65,7 @@ class RunDirectory:
     next write or the end of the block is a StorageError.
     """
 
-    def __init__(self, path: Path, held: files.RunLock) -> None:
+    def __init__(self, path: Path, held: RunLock) -> None:
         self.path = path
         self._lock = held
         self._began = True
@@ -70,13 +78,13 @@ class RunDirectory:
         the next free number, and lock it; RunExistsError if there is something already. With `overwrite`, only a
         directory that advsearch wrote is touched, and in it only what advsearch writes."""
         path = _numbered(default) if run is None else run_path(run)
-        files.check_there(path)  # or the folder of the study that it is a part of would be made
+        check_there(path)  # or the folder of the study that it is a part of would be made
         check_free(path, overwrite=overwrite)
         with storage_errors(path):
             path.mkdir(parents=True, exist_ok=True)
         try:
             with ExitStack() as undo:
-                held = files.RunLock(path)
+                held = RunLock(path)
                 undo.callback(held.release)
                 check_free(path, overwrite=overwrite)
                 with storage_errors(path):
@@ -122,11 +130,11 @@ class RunDirectory:
     def resume(cls, run: str | Path, config: Config | None = None) -> RunDirectory:
         """Open and lock the directory of a run, to go on with it by `config`, if anything goes on; an InputError says
         if another process works on it, or it would give other numbers than the run began with."""
-        files.check_there(run_path(run))
+        check_there(run_path(run))
         path = find_run(run)
         check_links(path)
         with ExitStack() as undo:
-            held = files.RunLock(path)
+            held = RunLock(path)
             undo.callback(held.release)
             opened = cls(path, held)
             undo.callback(opened.close)
@@ -147,12 +155,14 @@ class RunDirectory:
     def _check_same(self, config: Config) -> None:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
         now = config.deciding()
+        note = self.store.note(BEGUN_WITH)
         try:
-            before = json.loads(self.store.note(BEGUN_WITH) or "{}")  # older runs note nothing
+            before = json.loads(note or "null")
         except ValueError:
             before = None
         if not isinstance(before, dict):
-            raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got a damaged note")
+            got = "none" if note is None else "a damaged note"
+            raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got {got}")
         changed = [name for name, value in before.items() if name in now and value != now[name]]
         if changed:
             differ = ", ".join(f"{name} was {before[name]!r} and is {now[name]!r}" for name in changed)
@@ -223,7 +233,7 @@ class RunDirectory:
         """Remove what this run wrote, and the directory if that leaves it empty."""
         self._told()
         with suppress(OSError, StorageError):
-            files.check_there(self.path)  # else it is another's by now
+            check_there(self.path)  # else it is another's by now
             self.store.close()
             _clear(self.path)
             _remove_if_bare(self.path)
@@ -237,7 +247,7 @@ class RunDirectory:
     ) -> None:
         if error is None:
             try:
-                files.check_there(self.path)
+                check_there(self.path)
             finally:
                 self.close()
             return
@@ -284,27 +294,9 @@ def default_name(object_name: str, controls: Iterable[str]) -> str:
 
 
 def check_links(run: Path) -> None:
-    """Check that what a run's folder has is its own: one that somebody else made may link to any file, which would be
-    shown, copied or overwritten. The folder itself may be reached by a link. Small pictures, of which there may be a
+    """Check that what a run's folder has is its own, as `check_no_links`. Small pictures, of which there may be a
     million, are checked as each is read (`viewer.thumbnails`). Raises FileFormatError."""
-    folders = [str(run)]
-    while folders:
-        folder = folders.pop()
-        try:
-            with os.scandir(folder) as found:
-                inside = [one for one in found if folder != str(run) or one.name in (*CONTENTS, files.NAME)]
-        except OSError as error:
-            if error.errno == errno.ENOENT:  # it was removed meanwhile
-                continue
-            raise FileFormatError(f"{folder}: expected a folder of a run, got {error.strerror}") from None
-        for one in inside:
-            if one.is_symlink():
-                raise FileFormatError(f"{one.path}: expected a file or a folder of this run, got a link; remove it")
-            if one.is_dir(follow_symlinks=False):
-                if not folder.endswith(SMALL_PICTURES):
-                    folders.append(one.path)
-            elif not one.is_file(follow_symlinks=False) and one.name != files.NAME:
-                raise FileFormatError(f"{one.path}: expected a file of this run, got a pipe or the like; remove it")
+    check_no_links(run, CONTENTS, SMALL_PICTURES)
 
 
 def run_path(run: str | Path) -> Path:
@@ -416,7 +408,7 @@ def _is_leftover(path: Path) -> bool:
     """Whether it is what a kill leaves before there is a run: the lock, a part of a file, results without a byte."""
     if path.name == store.NAME:
         return path.is_file() and path.stat().st_size == 0
-    return path.name in (files.NAME, f"{store.NAME}-journal") or path.name.startswith(PART)
+    return path.name in (LOCK, f"{store.NAME}-journal") or path.name.startswith(PART)
 
 
 def _remove_if_bare(path: Path) -> None:

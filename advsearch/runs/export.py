@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import IO, Any, TypeGuard
 
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.files import JsonObject, JsonValue, open_regular, parse_json, read_text
+from advsearch.files import JsonObject, JsonValue
 from advsearch.options import NOT_A_NUMBER, Value
-from advsearch.runs.files import check_free_folder, placed_by, replacing, write_bytes, write_text
 from advsearch.runs.store import Row, Store
+from advsearch.trust.stored_files import open_regular, parse_json, read_text
+from advsearch.trust.writing import check_free_folder, placed_by, replacing, write_bytes, write_text
 
 FORMATS = ("csv", "json", "parquet")
 PAYLOAD = "payload"

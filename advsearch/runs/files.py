@@ -1,20 +1,13 @@
-"""The files of a run: written whole or not at all, also in a kill (a power cut may empty what can be made again), held
-by one process through a lock that the kernel drops when it ends; and `results.sqlite`: its tables, and how it is
-opened."""
+"""The files of a run: `results.sqlite`, its tables and how it is opened, and pictures."""
 
 from __future__ import annotations
 
 import errno
-import fcntl
 import io
 import os
-import re
 import sqlite3
-import stat
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
-from functools import cache
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,197 +15,22 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from advsearch.errors import FileFormatError, InputError, StorageError
-from advsearch.files import open_regular
+from advsearch.errors import FileFormatError
 from advsearch.pictures import png_of
+from advsearch.trust.databases import (
+    LARGEST,
+    check_before_writing,
+    connect_to_read,
+    protect,
+    read_schema,
+    read_version,
+    readable,
+)
+from advsearch.trust.stored_files import open_regular
+from advsearch.trust.writing import replacing, storage_errors, write_bytes
 
-PART = ".part-"  # prefix of a file that is still being written; what a killed process may leave behind
-
-_ADVICE = {
-    errno.ENOSPC: "the disk is full; free some space or choose another place with `run`",
-    errno.EDQUOT: "the disk quota is used up; free some space or choose another place with `run`",
-    errno.EROFS: "the file system is read-only; choose another place with `run`",
-    errno.EACCES: "there is no permission to write there; choose another place with `run`",
-    errno.EPERM: "writing there is not permitted; choose another place with `run`",
-    errno.ENOTDIR: "a part of the path is a file, not a folder; choose another place with `run`",
-    errno.EEXIST: "a file of that name stands where a folder is needed; choose another place with `run`",
-    errno.ENAMETOOLONG: "the name is too long; choose a shorter one with `run`",
-}
-
-_SQLITE_ADVICE = {
-    "full": _ADVICE[errno.ENOSPC],
-    "readonly": _ADVICE[errno.EROFS],
-    "unable to open": _ADVICE[errno.EACCES],
-    "locked": "another program holds it; close that and try again",
-}
-
-
-@contextmanager
-def storage_errors(path: Path) -> Iterator[None]:
-    """Turn errors of the operating system and of SQLite inside the block into a `StorageError` that names `path`."""
-    try:
-        yield
-    except (OSError, sqlite3.OperationalError) as error:
-        check_there(path)
-        if isinstance(error, OSError):
-            known, text = _ADVICE.get(error.errno or 0), str(error.strerror or error)
-        else:
-            known, text = next((how for words, how in _SQLITE_ADVICE.items() if words in str(error)), None), str(error)
-        advice = known or f"{text}; choose another place with `run`"
-        raise StorageError(f"cannot write {path}: {advice}") from error
-
-
-@contextmanager
-def placed_by(setting: str) -> Iterator[None]:
-    """Let the advice of a `StorageError` inside the block name the setting that says where the file goes."""
-    try:
-        yield
-    except StorageError as error:
-        raise StorageError(str(error).replace("`run`", f"`{setting}`")) from error
-
-
-@contextmanager
-def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Yield a path to write to; when the block ends well its file takes the place of `path` in one step. When it
-    raises, or the process is killed, `path` is as it was before. Missing folders are made. A `durable` file survives a
-    power cut; that takes some 10 ms."""
-    part = path.with_name(f"{PART}{os.getpid()}-{path.name}")
-    check_there(path)  # or missing folders would be made
-    try:
-        with storage_errors(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            part.unlink(missing_ok=True)  # what lies there may be somebody else's link
-            yield part
-            if durable:
-                _flush(part)
-            os.replace(part, path)
-            if durable:
-                _flush(path.parent)
-    finally:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
-
-
-def check_free_folder(out: Path, setting: str) -> None:
-    """Check that a folder that is to be written whole is not there, or is empty. Raises InputError, also of a link: a
-    folder takes the place of no link, and what it leads to may be somebody else's."""
-    if os.path.islink(out):
-        raise InputError(f"{setting}: expected a new or an empty folder, got the link {out}; name the folder itself")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{setting}: {out} is there already and not empty; name another folder")
-
-
-def write_bytes(path: Path, data: bytes, *, durable: bool = False) -> Path:
-    """Write `data` to `path`, whole or not at all, and return the path; `durable` as for `replacing`."""
-    with replacing(path, durable=durable) as part:
-        part.write_bytes(data)
-    return path
-
-
-def write_text(path: Path, text: str, *, durable: bool = True) -> Path:
-    """Write `text` in UTF-8 to `path`, whole or not at all, and return the path; `durable` as for `replacing`."""
-    return write_bytes(path, text.encode("utf-8"), durable=durable)
-
-
-def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-_open: dict[Path, tuple[Path, tuple[int, int]]] = {}
-"""Of the folders of runs that are written to here, the results and which file these are."""
-
-
-def note_open(results: Path) -> Callable[[], None]:
-    """Note that the results of a run are open for writing, for `check_there`; return what notes that they are not."""
-    with storage_errors(results):
-        found = results.stat()
-    entry = _open[results.parent] = results, (found.st_dev, found.st_ino)
-
-    def closed() -> None:
-        if _open.get(results.parent) is entry:
-            del _open[results.parent]
-
-    return closed
-
-
-def check_there(path: Path) -> None:
-    """Check that a path does not lie in the folder of a run that is written to here and was removed or renamed since:
-    what is open is still written then, but to nowhere. Raises StorageError."""
-    for folder in (path, *path.parents):
-        if folder not in _open:
-            continue
-        results, known = _open[folder]
-        try:
-            found = results.stat()
-        except OSError:
-            found = None
-        if found is None or (found.st_dev, found.st_ino) != known:
-            raise StorageError(
-                f"{folder}: the folder of this run was removed or renamed while the run went on; start it again, or "
-                "go on with what was renamed by advsearch resume"
-            )
-
-
-NAME = ".lock"
-
-
-class RunLock:
-    """The lock on a run directory, held until `release` or the end of the process; an InputError names who else works
-    on it."""
-
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / NAME
-        with storage_errors(self._path):
-            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
-        if not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
-            self.release()
-            raise FileFormatError(f"{self._path}: expected an ordinary file, got a pipe or the like; remove it")
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            os.truncate(self._descriptor, 0)
-            os.write(self._descriptor, str(os.getpid()).encode())
-        except OSError as error:
-            pid = os.pread(self._descriptor, 32, 0).decode(errors="replace")
-            self.release()
-            if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-                owner = f"process {pid}" if pid.isdigit() else "another process"
-                raise InputError(
-                    f"{folder}: {owner} is working on this run; wait for it or choose another name with `run`"
-                ) from None
-            if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
-                raise StorageError(f"{folder}: the file system has no locks; choose a local disk with `run`") from None
-            raise StorageError(f"cannot lock {folder}: {error.strerror}; choose another place with `run`") from None
-
-    def release(self) -> None:
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
-
-
-def is_held(folder: Path) -> bool:
-    """Whether a process works on the run in `folder`; nothing is written."""
-    try:
-        descriptor = os.open(folder / NAME, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
-
-
-DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run again"
-LARGEST = 64 << 30
-MAX_SCHEMA_ENTRIES = 100  # of a results.sqlite that are looked at; ours has fewer than ten
 APPLICATION_ID = 0x41445653  # in the header of every results.sqlite that is ours: "ADVS"
-VERSION = 9
+VERSION = 10
 """Of the tables; in the header of the file. Files of another version are read by the advsearch that wrote them."""
 
 SCHEMA = f"""
@@ -263,9 +81,6 @@ SCHEMA = f"""
     PRAGMA user_version = {VERSION};
 """
 
-_JOURNAL = bytes.fromhex("d9d505f920a163d7")
-"""The last bytes of a journal that names a file (https://www.sqlite.org/fileformat2.html)."""
-
 
 def is_results_database(path: Path) -> bool:
     """Return whether the file at `path` starts like a results.sqlite of advsearch; a link does not."""
@@ -282,68 +97,16 @@ def is_results_database(path: Path) -> bool:
 def is_bare(path: Path) -> bool:
     """Return whether a file of ours has no tables yet: its process was killed as it made them."""
     with readable(path), closing(connect_to_read(path)) as db:
-        return _version(db) == 0 and not _schema(db)
-
-
-@contextmanager
-def readable(path: Path) -> Iterator[None]:
-    """Turn what SQLite says of a damaged file inside the block into an error that names it."""
-    try:
-        yield
-    except (sqlite3.Error, UnicodeDecodeError) as error:
-        text = repr(str(error))[1:-1][:200]  # it quotes what is in the file
-        raise FileFormatError(f"{path}: expected a results.sqlite of advsearch, got {text}; {DAMAGED}") from error
-
-
-def check_schema(db: sqlite3.Connection, path: Path) -> None:
-    """Check that the file has what `SCHEMA` makes and no more: a view or a trigger is code, and may never end."""
-    if _schema(db) != _own_schema():
-        db.close()
-        raise FileFormatError(f"{path}: expected the tables of a run, got others; {DAMAGED}")
-
-
-@cache
-def _own_schema() -> Counter[Any]:
-    with closing(sqlite3.connect(":memory:")) as db:
-        db.executescript(SCHEMA)
-        return _schema(db)
-
-
-def _schema(db: sqlite3.Connection) -> Counter[Any]:
-    """Return every entry of the schema, whatever its name: type, name, table and statement.
-
-    Statements are compared without comments and line breaks, which mean nothing to SQLite.
-    """
-    entries = db.execute("SELECT type, name, tbl_name, sql FROM sqlite_master").fetchmany(MAX_SCHEMA_ENTRIES)
-    return Counter((*names, None if sql is None else _without_comments(str(sql))) for *names, sql in entries)
-
-
-def _without_comments(statement: str) -> str:
-    without_comments = "\n".join(line.partition("--")[0] for line in statement.split("\n"))
-    return re.sub("[ \n]+", " ", without_comments).strip(" ")
-
-
-def _protect(db: sqlite3.Connection) -> None:
-    """Let a stranger's file call no function of its own choosing, and let SQLite look at each page that it reads.
-
-    Nothing here needs the schema, so nothing of the file's own statements has run by then.
-    """
-    db.execute("PRAGMA trusted_schema = OFF")
-    db.execute("PRAGMA writable_schema = OFF")
-    db.execute("PRAGMA cell_size_check = ON")
-    db.execute("PRAGMA mmap_size = 0")
+        return read_version(db) == 0 and not read_schema(db)
 
 
 def connect_to_write(path: Path) -> sqlite3.Connection:
-    if os.path.islink(path):
-        raise FileFormatError(f"{path}: expected a file of this run, got a link to another; {DAMAGED}")
-    if path.exists():
-        open_regular(path, "a results.sqlite", LARGEST).close()
-    _check_journal(path.with_name(f"{path.name}-journal"))
+    check_before_writing(path)
     with storage_errors(path):
         db = sqlite3.connect(path)
-        _protect(db)
-        if _version(db) == 0 and not _schema(db):  # there is nothing in it to lose yet, so the disk isn't waited for
+        protect(db)
+        if read_version(db) == 0 and not read_schema(db):
+            # there is nothing in it to lose yet, so the disk isn't waited for
             db.execute("PRAGMA synchronous = OFF")
             db.execute(f"PRAGMA application_id = {APPLICATION_ID}")  # before the log, so that the file itself has it
             db.execute("PRAGMA journal_mode = WAL")
@@ -351,38 +114,9 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
     return db
 
 
-def _check_journal(journal: Path) -> None:
-    """Refuse a journal that ends with the name of a file: SQLite would delete that file. None of ours does."""
-    if not os.path.lexists(journal):
-        return
-    with open_regular(journal, "a journal of SQLite", LARGEST) as file:
-        file.seek(-min(len(_JOURNAL), os.fstat(file.fileno()).st_size), os.SEEK_END)
-        if file.read() == _JOURNAL:
-            raise FileFormatError(f"{journal}: expected the journal of one file, got one that names another; remove it")
-
-
-def connect_to_read(path: Path) -> sqlite3.Connection:
-    """Open the file for reading; where the log's index can't be made (a read-only disk), as one that never changes."""
-    if not os.path.isfile(path):
-        raise FileFormatError(f"{path}: expected the results of a run, got no such file; check the name of the run")
-    address = path.resolve().as_uri()
-    db = sqlite3.connect(f"{address}?mode=ro", uri=True)
-    try:
-        _version(db)
-    except sqlite3.OperationalError:
-        db.close()
-        db = sqlite3.connect(f"{address}?immutable=1", uri=True)
-    _protect(db)
-    return db
-
-
-def _version(db: sqlite3.Connection) -> int:
-    return int(db.execute("PRAGMA user_version").fetchone()[0])
-
-
 def check_version(db: sqlite3.Connection, path: Path) -> None:
     """Refuse, by a FileFormatError, a file of another version, and say which advsearch reads it."""
-    version, day = _version(db), ""
+    version, day = read_version(db), ""
     if version == VERSION:
         return
     with suppress(sqlite3.Error):

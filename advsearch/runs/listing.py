@@ -13,6 +13,7 @@ from advsearch.runs import files, store, summary
 from advsearch.runs.directory import CONFIG, check_links, is_run
 from advsearch.runs.results import Result
 from advsearch.settings import read_yaml
+from advsearch.trust.writing import is_held
 
 FAULT = "it cannot be read, which is a fault of advsearch"
 
@@ -63,7 +64,7 @@ _LISTED: dict[tuple[str, bool], tuple[object, Listed]] = {}
 def listed_run(path: Path, *, counts: bool = True) -> Listed:
     """Return the run in a folder; what cannot be read is shown as far as it can, and `fault` says why. To count rows
     takes a second for a million. A run is read again where its files have changed, or a process works on it."""
-    running = files.is_held(path)
+    running = is_held(path)
     read = [path / name for name in (CONFIG, summary.NAME, store.NAME, f"{store.NAME}-wal")]
     key, state = (os.path.abspath(path), counts), (str(path), running, *map(_state, read))
     if key not in _LISTED or _LISTED[key][0] != state or (running and counts):

@@ -483,14 +483,14 @@ class PrintTerms(Fields):
 class SharedWork(Fields):
     """How the workers did that shared the work, in this sitting."""
 
-    most: int = Field(description="workers that were ready at once, at most")
-    lost: int = Field(description="that went away")
+    most: int = Field(description="workers that had work at once, at most")
+    lost: int = Field(description="that died or went away")
     refused: int = Field(description="that could not do it")
-    retried: int = Field(description="batches that were given out again")
+    retried: int = Field(description="batches that this process gave out again")
     batches: int = Field(description="batches that came back")
     busy: JsonFloat = Field(description="seconds that workers were at batches")
     loading: JsonFloat = Field(description="seconds that they loaded scenes and models")
-    alive: JsonFloat = Field(description="seconds that they were there and ready")
+    alive: JsonFloat = Field(description="seconds that they were there and did not load")
     utilisation: JsonFloat | None = Field(description="`busy` over `alive`")
     machines: dict[str, dict[str, str]] = Field(description="what rows call by a name, where machines are not alike")
 

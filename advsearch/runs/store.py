@@ -17,20 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advsearch.errors import FileFormatError
-from advsearch.files import JsonValue, parse_json
+from advsearch.files import JsonValue
 from advsearch.options import Value
-from advsearch.runs.files import (
-    DAMAGED,
-    check_schema,
-    check_there,
-    check_version,
-    connect_to_read,
-    connect_to_write,
-    note_open,
-    readable,
-    storage_errors,
-)
+from advsearch.runs.files import SCHEMA, check_version, connect_to_write
 from advsearch.runs.results import plain
+from advsearch.trust.databases import DAMAGED, check_schema, connect_to_read, readable
+from advsearch.trust.stored_files import parse_json
+from advsearch.trust.writing import check_there, note_open, storage_errors
 
 NAME = "results.sqlite"
 SYNC_INTERVAL = 1.0  # least seconds between two forced writes to the disk; what a power cut may cost
@@ -106,7 +99,7 @@ class Store:
         with readable(path):
             self._db = connect_to_read(path) if read_only else connect_to_write(path)
             check_version(self._db, path)
-            check_schema(self._db, path)
+            check_schema(self._db, path, SCHEMA)
         self._closed: Callable[[], None] | None = None if read_only else note_open(path)
 
     def append(self, rows: Sequence[Row], told: Told | None = None) -> None:

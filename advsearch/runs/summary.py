@@ -22,10 +22,11 @@ from pydantic import ValidationError
 
 from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import FileFormatError
-from advsearch.files import opened_for, parse_json, read_bytes, read_text, split_paths
-from advsearch.runs.files import is_held, write_bytes, write_text
+from advsearch.files import split_paths
 from advsearch.runs.results import RUNNING, Result, kind_of
 from advsearch.settings.configuration import FILES
+from advsearch.trust.stored_files import opened_for, parse_json, read_bytes, read_text
+from advsearch.trust.writing import is_held, write_bytes, write_text
 
 NAME = "summary.json"
 LARGEST = 64 << 20

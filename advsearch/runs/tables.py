@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from itertools import islice
 from math import prod
 from pathlib import Path
@@ -25,9 +25,10 @@ from advsearch.runs.store import NAME, Row, Store
 # ---------------------------------------------------------------------------------------------------------------------
 # Which rows of a sweep are independent: those of different *units*, each of one draw. A unit is a drive with all its
 # frames, or a picture, with the predictions of all models and, where one was swept, without and with the adversarial
-# scene of a run.
+# scene of a run. Where nothing is drawn, samples of a point of the grid differ in noise alone: they are one unit.
 
 NOTE = "units"  # the note of a run that says it
+PICTURE, CONFIGURATION, DRIVE = "picture", "configuration", "drive"
 
 Number = TypeVar("Number", int, npt.NDArray[np.int64])
 
@@ -45,17 +46,21 @@ class Units:
     frames: Annotated[int, Field(strict=True, ge=0)] | None = None  # place of the axis whose values are frames
     samples: Count = 1  # draws at each point of the grid
     models: Count = 1  # that are shown the same pictures
-    again: Annotated[int, Field(strict=True, ge=0, le=MOST_ROWS)] = (
-        0  # pictures after which the draws come again; 0 for never
-    )
+    # pictures after which the draws come again; 0 for never
+    again: Annotated[int, Field(strict=True, ge=0, le=MOST_ROWS)] = 0
+    noise: Count = 1  # pictures of each draw that differ in noise alone
 
     @property
     def size(self) -> int:
-        return self.models * (2 if self.again else 1) * (1 if self.frames is None else self.sizes[self.frames])
+        frames = 1 if self.frames is None else self.sizes[self.frames]
+        return self.models * (2 if self.again else 1) * frames * self.noise
 
     @property
     def name(self) -> str:
-        return "picture" if self.frames is None or self.sizes[self.frames] < 2 else "drive"
+        """What a unit is called."""
+        if self.frames is not None and self.sizes[self.frames] > 1:
+            return DRIVE
+        return CONFIGURATION if self.noise > 1 else PICTURE
 
     def of(self, step: Number) -> Number:
         """Return the number of the unit of a row, or of rows (n,), by their steps."""
@@ -65,6 +70,7 @@ class Units:
         """Return the number of the draw of a picture, by its number in the whole sweep."""
         if self.again:
             picture = picture % self.again
+        picture = picture // self.noise
         if self.frames is None:
             return picture
         place, sample = picture // self.samples, picture % self.samples
@@ -73,15 +79,18 @@ class Units:
         return (before * after + place % after) * self.samples + sample
 
 
-def units_of(store: Store) -> Units | None:
-    """Return what a run notes of its units; None where it notes nothing."""
+def units_of(store: Store, *, is_drawn: bool = True) -> Units | None:
+    """Return what a run notes of its units; None where it notes nothing. Older notes do not say that samples are noise:
+    the summary's sampler does, so that the caller says whether anything `is_drawn`."""
     noted = store.noted(NOTE)
     if noted is None:
         return None
     with suppress(ValidationError):
         units = TypeAdapter(Units).validate_python(noted)
+        if not is_drawn and units.noise == 1:
+            units = replace(units, samples=1, noise=units.samples)
         has_frames = units.frames is None or units.frames < len(units.sizes)
-        if has_frames and prod(units.sizes) * units.samples * units.models <= MOST_ROWS:
+        if has_frames and prod(units.sizes) * units.samples * units.noise * units.models <= MOST_ROWS:
             return units
     raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}")
 
@@ -120,14 +129,21 @@ def to_pandas(rows: Iterable[Row]) -> pd.DataFrame:
 
 
 def read_sweep(
-    run: Path, after: int = 0, most: int | None = None, also: Callable[[Row], Mapping[str, float]] | None = None
+    run: Path,
+    after: int = 0,
+    most: int | None = None,
+    also: Callable[[Row], Mapping[str, float]] | None = None,
+    *,
+    is_drawn: bool = True,
 ) -> pd.DataFrame:
     """Return the rows of the sweep in `run` that were written after the row with this id, `most` of them at most, as
-    `sweep_frame` does; `unit` says which rows are not independent (`Units`), and ``attrs["edges"]`` where the
-    ranges of drawn parameters are cut. Raises FileFormatError where the results cannot be read."""
+    `sweep_frame` does; `unit` says which rows are not independent (`Units`, `units_of`), ``attrs["unit name"]`` what
+    such a unit is, and ``attrs["edges"]`` where the ranges of drawn parameters are cut. Raises FileFormatError where
+    the results cannot be read."""
     with Store(run / NAME, read_only=True) as store:
         frame, noted = sweep_frame(islice(store.rows(KIND, after=after), most), also), store.noted(EDGES)
-        units = units_of(store)
+        units = units_of(store, is_drawn=is_drawn)
+    frame.attrs["unit name"] = PICTURE if units is None else units.name
     if units is not None:
         frame["unit"] = units.of(frame["step"].to_numpy())
     for name, ends in noted.items() if isinstance(noted, dict) else ():

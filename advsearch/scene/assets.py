@@ -100,11 +100,15 @@ class Material:
 
 
 @dataclass(frozen=True)
-class UpAxis:
-    """The axis of a mesh file that is taken for up."""
+class FileAxis:
+    """An axis of a mesh file that is taken for up, or for the front."""
 
-    axis: str  # "y" or "z"
-    reason: str = ""  # why, in one sentence with what to do if it is wrong; empty where the user or the format said it
+    axis: str  # up: "y" or "z"; front: one of `FACINGS`
+    reason: str = ""  # why, and what to do if it is wrong; empty where the user said it, or the format which is up
+
+
+FACINGS = ("+x", "-x", "+y", "-y", "+z", "-z")
+"""Axes of a mesh file along which the front of what is in it may face."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,11 +134,13 @@ class ObjectAsset(Shape):
 
     source: str = ""  # where it came from, for messages and logs
     warnings: tuple[str, ...] = ()  # what the importer had to repair or leave out, one sentence each
-    up: UpAxis | None = None  # the axis of the file that was taken for up
+    up: FileAxis | None = None  # the axis of the file that was taken for up
+    front: FileAxis | None = None  # the axis of the file that was taken for its front, which is +x here
     # of several materials, what each of `mesh.materials` is like beside its base colour; `material` covers the rest
     finishes: Mapping[str, Material] = field(default_factory=dict)
     metres: float | None = None  # its largest extent, where distances of the camera are in metres (see below)
     extent: float | None = None  # its largest extent in the coordinates of its file
+    drives: bool = True  # in a lane it faces as the traffic drives; otherwise it faces those who come, as signs do
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -208,9 +208,8 @@ class CameraPreset:
     height: float  # of the lens above the floor or the road, metres
     fov: float  # field of view along the larger side of the picture, degrees
     distance: float  # from the object's middle, metres; further where the object would not fit
-    # degrees around the object: before what faces it, and behind a vehicle of the road; None for the scene's own
-    azimuth: float | None
-    aside: float  # how far to either side of it a search goes, degrees; 180 for all around
+    in_lane: bool  # azimuth 0 is in the object's lane, looking along it: behind what drives there
+    aside: float  # how far to either side a search goes, degrees; 180 for all around
     search: Mapping[str, tuple[float, float]]  # the other ranges that are searched by default; what has none stays
 
 
@@ -219,14 +218,14 @@ PRESETS: Mapping[str, CameraPreset] = MappingProxyType(
         # Behind the windscreen of a car, in the lane of the object. What glass and dashboard do to a picture is not
         # in it.
         "dashcam": CameraPreset(
-            height=1.3, fov=75.0, distance=10.0, azimuth=0.0, aside=10.0,
+            height=1.3, fov=75.0, distance=10.0, in_lane=True, aside=10.0,
             search={"distance": (6.0, 60.0), "fov": (60.0, 90.0)},
         ),
         # The head of a humanoid: the Unitree G1 is 1.32 m tall (its product page), with a RealSense D435i in its face,
         # about a tenth of a metre below the top. The colour picture of that has 69 x 42 degrees, and its depth reaches
         # to 3 m (Clearpath Robotics, documentation of the RealSense D435).
         "robot": CameraPreset(
-            height=1.2, fov=69.0, distance=1.0, azimuth=None, aside=180.0, search={"distance": (0.5, 3.0)},
+            height=1.2, fov=69.0, distance=1.0, in_lane=False, aside=180.0, search={"distance": (0.5, 3.0)},
         ),
     }
 )  # fmt: skip

@@ -17,7 +17,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from advsearch.errors import FileFormatError
-from advsearch.files import MESHES, parse_json, parsed, present_text
+from advsearch.files import MESHES
 from advsearch.scene.camera_dialects import (
     METASHAPE_FILE,
     check_text_format,
@@ -28,7 +28,8 @@ from advsearch.scene.camera_dialects import (
 from advsearch.scene.camera_entries import Entries, made, nothing, number, plain, select_camera, with_told
 from advsearch.scene.camera_model import BROWN_CONRADY, COEFFICIENTS, EQUIRECTANGULAR, FISHEYE, CameraModel
 from advsearch.scene.importing.files import CAMERAS, shown
-from advsearch.yaml_text import LARGEST, parse_yaml
+from advsearch.trust.stored_files import parse_json, parsed, present_text
+from advsearch.trust.yaml_text import LARGEST, parse_yaml
 
 LARGEST_JSON = 1 << 25  # bytes of a JSON file, which may hold the pose of every picture
 MOST_BINNED = 64  # pixels along a side that a sensor makes into one, at most

@@ -13,6 +13,7 @@ import tempfile
 import time
 import weakref
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,6 @@ import OpenEXR
 import torch
 from torch import Tensor
 
-from advsearch import files
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.scene.assembly import posed
 from advsearch.scene.assets import Material, Mesh, Shape, pose_of
@@ -29,10 +29,12 @@ from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import glb
 from advsearch.scene.grounds import paved
-from advsearch.scene.importing.blender import command, last_line, surroundings
+from advsearch.scene.importing.blender import command, last_line
 from advsearch.scene.parts import BallLamp, MeshPart, PointLamp
+from advsearch.trust.programs import surroundings
+from advsearch.trust.stored_files import scaled
 
-LONGEST = 300  # seconds that one picture may take, the start included, before `advsearch.files.scaled`
+LONGEST = 300  # seconds that one picture may take, the start included, before `scaled`
 MATT = Material(roughness=1.0, metallic=0.0, specular=0.0)  # of the ground
 PAUSE = 0.02  # seconds between looks at whether a picture is there
 
@@ -194,7 +196,15 @@ class Cycles:
             "bounces": max(0, self._depth - 2),
             "denoise": self._denoise,
         }
-        return message, glb(meshes), radiance
+        return message, glb([_turn_for_blender(mesh) for mesh in meshes]), radiance
+
+
+def _turn_for_blender(shape: Shape) -> Shape:
+    """Return a mesh turned so that Blender, for which the front of a glTF file is -y, has our axes."""
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
+    mesh = shape.mesh
+    turned = replace(mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T)
+    return replace(shape, mesh=turned)
 
 
 def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[Shape]:
@@ -242,7 +252,7 @@ class _Process:
     def picture(self, seed: int, spp: int) -> Tensor:
         """One picture with its own noise, (H, W, 3)."""
         self._count += 1
-        path, until = self._folder / f"{self._count}.exr", time.monotonic() + files.scaled(LONGEST)
+        path, until = self._folder / f"{self._count}.exr", time.monotonic() + scaled(LONGEST)
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(f"{seed} {spp} {self._count}\n".encode())
@@ -254,7 +264,7 @@ class _Process:
                 words = last_line(self._said.read_text("utf-8", "replace"))
                 raise BlenderError(f"Blender stopped{words}")
             if time.monotonic() > until:
-                raise BlenderError(f"Blender had not rendered it after {files.scaled(LONGEST)} seconds")
+                raise BlenderError(f"Blender had not rendered it after {scaled(LONGEST)} seconds")
             time.sleep(PAUSE)
         with OpenEXR.File(str(path)) as picture:
             pixels = next(iter(picture.channels().values())).pixels

@@ -17,14 +17,21 @@ from typing import Any
 import torch
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.files import reading
 from advsearch.scene import geometry, library, settings
-from advsearch.scene.assets import TRIPOD, Doubles, EnvironmentAsset, Material, ObjectAsset, doubts, on_roads, sized
+from advsearch.scene.assets import TRIPOD, Doubles, EnvironmentAsset, Material, ObjectAsset, doubts, sized
 from advsearch.scene.camera_entries import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
 from advsearch.scene.formation import metered_gain
-from advsearch.scene.grounds import Photograph, on_its_ground, paved, photograph_of
+from advsearch.scene.grounds import (
+    Photograph,
+    has_lanes,
+    is_against_traffic,
+    on_its_ground,
+    paved,
+    photograph_of,
+    traffic_remark,
+)
 from advsearch.scene.headlamps import with_lamps
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
@@ -44,6 +51,7 @@ from advsearch.scene.places.quads import FLOOR
 from advsearch.scene.rig import Mount, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.things import ThingPart, with_solids_checked, with_things
+from advsearch.trust.stored_files import reading
 
 DEFAULT_ENVIRONMENT = "studio"
 OBJECT = "object"  # the name of the mesh under test
@@ -66,6 +74,7 @@ class SceneDescription:
     object_spec: str = ""  # how the object was asked for: a bundled name, a path, or an asset's own name
     environment_spec: str = ""  # how the environment was asked for, likewise
     up: str | None = None  # the up axis that was given for a mesh file
+    facing: str | None = None  # the axis of a mesh file that was given for its front
     size: float | None = None  # the object's longest side in metres that was given
     unit: str | None = None  # of the object's file, that was given (`advsearch.scene.assets.UNITS`)
     given: frozenset[str] = frozenset()  # what was asked for: names of settings, and "environment"
@@ -143,8 +152,8 @@ class SceneDescription:
         on_table = on_plane and self.object.metres <= ON_TABLES
         if "camera.elevation" not in self.given:
             own["camera.height"] = preset.height - (TABLE if on_table or FLOOR in self.around else 0.0)
-        if preset.azimuth is not None:
-            own["camera.azimuth"] = preset.azimuth + (180.0 if on_roads(self.object) else 0.0)
+        if preset.in_lane:
+            own["camera.azimuth"] = 0.0
         if on_table:
             own["ground.size"] = TABLE_SIDE / self.metres
         values = {**self.values, **{setting: value for setting, value in own.items() if setting not in self.given}}
@@ -154,6 +163,16 @@ class SceneDescription:
         fov = torch.tensor(seen.number("camera.fov"), dtype=torch.float64)
         fitted = float(geometry.framing_distance(seen, fov, seen.aspect)) * seen.metres
         return seen.with_values(camera__distance=max(preset.distance, fitted))
+
+    @property
+    def azimuth_zero(self) -> float:
+        """The direction from the object, in degrees from +x, in which the camera of azimuth 0 stands."""
+        return 180.0 if self.is_in_lane and self.object.drives else 0.0
+
+    @property
+    def is_in_lane(self) -> bool:
+        """Whether the camera is mounted in a car that drives in the object's lane."""
+        return self.preset != "" and PRESETS[self.preset].in_lane
 
     @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
@@ -233,7 +252,16 @@ class SceneDescription:
         lit = () if self.environment is None else self.environment.warnings
         seen = () if self.camera_model is None else self.camera_model.notes
         size = doubts(self.object, asked=self.size is not None, laid=paved(self))
-        return tuple(dict.fromkeys((*self.object.notes, *size, *lit, *seen, *self.remarks)))
+        front = self.object.front
+        faces = (front.reason,) if front is not None and (self.is_in_lane or has_lanes(self)) else ()
+        drives = (traffic_remark(self),) if self._meets_traffic else ()
+        notes = (*self.object.notes, *faces, *size, *lit, *seen, *drives, *self.remarks)
+        return tuple(dict.fromkeys(note for note in notes if note))
+
+    @property
+    def _meets_traffic(self) -> bool:
+        orbits = self.camera == ORBIT_CAMERA
+        return orbits and is_against_traffic(self, geometry.camera_to_world(self))
 
     def environment_for(self, who: str) -> EnvironmentAsset:
         """Return the environment for what cannot do without a map. Raises InputError: the scene has none."""
@@ -320,6 +348,7 @@ def describe(
     *,
     given: settings.Given | None = None,
     up: str | None = None,
+    facing: str | None = None,
     size: float | None = None,
     unit: str | None = None,
     plugins: Mapping[str, object] | None = None,
@@ -336,12 +365,14 @@ def describe(
     if up is not None and (mitsuba or node is not None):
         why = "the first camera of a Mitsuba scene says which way is up" if mitsuba else "glTF files have y up"
         raise InputError(f"up: {why}; leave `up` out")
+    if facing is not None and (mitsuba or node is not None):
+        raise InputError("facing: a scene file stays as it is; leave `facing` out, or turn the object: `set` pose.yaw")
     if mitsuba:
         from advsearch.scene.mitsuba_backend.scene_files import import_plugins  # a circle: it takes descriptions
     if plugins is not None:
         around = import_plugins(plugins, node or str(object_spec))
     elif node is None:
-        around = ImportedScene(_object(object_spec, up))
+        around = ImportedScene(_object(object_spec, up, facing))
     else:
         with reading(path := Path(str(file))):
             around = import_plugins(path, node) if mitsuba else import_scene(path, node)
@@ -363,14 +394,14 @@ def describe(
         environment = library.load_environment(str(lit_by))
     orbits = any(name.startswith("camera.") and name != "camera.exposure" for name in given)
     described = SceneDescription(
-        around.object, environment, values, _spec(object_spec), _spec(lit_by), up, size, unit,
+        around.object, environment, values, _spec(object_spec), _spec(lit_by), up, facing, size, unit,
         given=frozenset(given) | (frozenset() if environment_spec is None else {ENVIRONMENT}),
         parts=around.surroundings,
         cameras=around.cameras,
         camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
         metered=not mitsuba,
     )  # fmt: skip
-    described = with_things(on_its_ground(described), things, lambda spec: _object(spec, None))
+    described = with_things(on_its_ground(described), things, _load_thing)
     described = with_lamps(with_solids_checked(described))
     check_meshes(described, values)
     idle = [name for name in given if name.startswith("material.")]
@@ -421,16 +452,22 @@ def _spec(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:
     return spec.name if isinstance(spec, (ObjectAsset, EnvironmentAsset)) else str(spec)
 
 
-def _object(spec: str | Path | ObjectAsset, up: str | None) -> ObjectAsset:
+def _load_thing(spec: str, facing: str | None) -> ObjectAsset:
+    return _object(spec, None, facing)
+
+
+def _object(spec: str | Path | ObjectAsset, up: str | None, facing: str | None) -> ObjectAsset:
     if isinstance(spec, ObjectAsset):
         return spec
     if is_path(spec):
         with reading(spec):
-            return import_object(Path(spec), up="y" if up == "y" else "z" if up == "z" else None)
+            return import_object(Path(spec), up="y" if up == "y" else "z" if up == "z" else None, facing=facing)
     if up is not None:
         raise InputError(
             f"up: bundled objects stand upright already; leave `up` out, or give a file instead of {spec!r}"
         )
+    if facing is not None:
+        raise InputError(f"facing: {spec} is bundled and faces +x; leave `facing` out, or turn it: `set` pose.yaw")
     return library.load_object(str(spec))
 
 

@@ -155,7 +155,8 @@ def camera_to_world(description: SceneDescription, aspect: float | None = None) 
     if height is not None:
         above = (height / description.metres - float(middle(description)[2])) / distance
         elevation = math.degrees(math.asin(min(max(above, -STEEPEST), STEEPEST)))
-    axes = camera_axes(number("camera.azimuth"), elevation, number("camera.roll"))
+    azimuth = description.azimuth_zero + number("camera.azimuth")
+    axes = camera_axes(azimuth, elevation, number("camera.roll"))
     return pose_of(np.stack([axes[0], axes[1], -axes[2]], axis=1), middle(description) + distance * axes[2])
 
 

@@ -1,4 +1,6 @@
-"""Meshes as binary glTF 2.0 (.glb): y up, one node a mesh, its texture inside as a PNG or JPEG file of 8 bits.
+"""Meshes as binary glTF 2.0 (.glb): one node a mesh, its texture inside as a PNG or JPEG file of 8 bits.
+
+Up is +y, and the front, our +x, is +z, as the format says of an asset (glTF 2.0, section 3.4).
 
 Materials have the numbers of the principled surface (glTF 2.0, section 3.9, and the extensions KHR_materials_specular
 and KHR_materials_clearcoat): a specular of 0.5 reflects 4 % at normal incidence, as glTF's default does.
@@ -165,8 +167,8 @@ def _material(shape: Shape, texture: dict[str, int]) -> dict[str, Any]:
 
 
 def _y_up(vectors: Floats) -> Floats:
-    """Turn (N, 3) from z up to y up, by 90 degrees about x."""
-    return np.stack([vectors[:, 0], vectors[:, 2], -vectors[:, 1]], axis=1).astype(np.float32)
+    """Turn (N, 3) from z up and +x ahead to y up and +z ahead."""
+    return np.stack([vectors[:, 1], vectors[:, 2], vectors[:, 0]], axis=1).astype(np.float32)
 
 
 def _levels(color: Floats) -> Levels:

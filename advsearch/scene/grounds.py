@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.scene import settings
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Mesh
-from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.geometry import camera_to_world, middle
 from advsearch.scene.library import BUNDLED_ENVIRONMENT
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.places.avenue import AVENUE, built
@@ -107,6 +107,33 @@ def paved(scene: SceneDescription) -> bool:
     return not scene.around.keys().isdisjoint(LAID)
 
 
+def has_lanes(scene: SceneDescription) -> bool:
+    """Tell whether the object stands in a lane, where what faces +x drives along it."""
+    return ROAD in scene.around and find_ground_kind(scene) != settings.CAR_PARK
+
+
+LANE_SIDE = 1.75  # metres from the middle of the object's lane to its side
+CAR_CAMERA = 2.5  # metres above the road up to which a camera in the lane may be that of a car
+
+
+def is_against_traffic(scene: SceneDescription, camera: Doubles) -> bool:
+    """Tell whether a camera of a pose (4, 4) drives in the object's lane towards its front."""
+    if not (scene.object.drives and (scene.is_in_lane or has_lanes(scene))):
+        return False
+    ahead, aside = (camera[:2, 3] - middle(scene)[:2]) * scene.metres
+    height = float(camera[2, 3]) * scene.metres
+    return bool(ahead > 0.0 and abs(aside) <= LANE_SIDE and height <= CAR_CAMERA)
+
+
+def traffic_remark(scene: SceneDescription) -> str:
+    """Return what users are told of a camera that drives against the traffic."""
+    behind = (180.0 - scene.azimuth_zero) % 360.0
+    return (
+        f"The camera is in the lane of {scene.object.name} and looks at its front, against the traffic; behind it is "
+        f"`set` camera.azimuth={behind:g}"
+    )
+
+
 def enclosed(scene: SceneDescription) -> bool:
     """Tell whether so much stands around the object that light paths seldom leave the scene."""
     return any(part.laid and part.name != ROAD for part in scene.around.values())
@@ -120,13 +147,21 @@ PLACES: Mapping[str, Callable[..., tuple[MeshPart, ...]]] = {
 """What makes the meshes of each kind of ground that is a place."""
 
 
+def find_ground_kind(scene: SceneDescription) -> str | None:
+    """Return the kind of ground that a scene's environment and its settings ask for; None where they name none."""
+    requested = scene.values.get("ground.kind")
+    if scene.number("ground.size") <= 0.0:
+        return None
+    if requested is not None:
+        return settings.GROUND_KINDS[int(requested)]
+    if scene.environment is None or not scene.given.isdisjoint(settings.TABLE_SETTINGS):
+        return None
+    return scene.environment.ground
+
+
 def on_its_ground(scene: SceneDescription) -> SceneDescription:
     """Return the scene with the road or the place that its environment and its settings ask for, and no other."""
-    kind, asked = None, scene.values.get("ground.kind")
-    if scene.number("ground.size") > 0.0 and asked is not None:
-        kind = settings.GROUND_KINDS[int(asked)]
-    elif scene.number("ground.size") > 0.0 and scene.given.isdisjoint(settings.TABLE_SETTINGS):
-        kind = None if scene.environment is None else scene.environment.ground
+    kind = find_ground_kind(scene)
     others = tuple(part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid))
     if kind in settings.PLACES:
         light, dark = scene.environment, kind == settings.LIT_ROOM

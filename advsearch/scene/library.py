@@ -114,6 +114,7 @@ def load_object(name: str) -> ObjectAsset:
             surface=finished(mesh, finishes, material) if finishes else None,
             finishes=finishes,
             metres=facts["metres"],
+            drives=facts.get("drives", False),
         )
     except (OSError, ValueError, KeyError, TypeError, FileFormatError) as error:
         raise FileFormatError(f"bundled object {name!r} cannot be read ({error}); reinstall advsearch") from error

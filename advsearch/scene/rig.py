@@ -18,13 +18,13 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import FileFormatError
-from advsearch.files import parse_json, parsed, present_text, read_text
 from advsearch.scene.assets import Doubles, pose_of
 from advsearch.scene.camera_files import LARGEST_JSON, OF_A_FRAME, read_camera
 from advsearch.scene.camera_model import CameraModel
 from advsearch.scene.geometry import rotation
 from advsearch.scene.skeleton import entries_of_turn
-from advsearch.yaml_text import LARGEST, parse_yaml
+from advsearch.trust.stored_files import parse_json, parsed, present_text, read_text
+from advsearch.trust.yaml_text import LARGEST, parse_yaml
 
 MOST_CAMERAS = 32
 FARTHEST = 1e4  # metres, or object sizes, that a camera may be from the first

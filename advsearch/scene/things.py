@@ -21,6 +21,7 @@ from scipy.spatial import ConvexHull
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import LARGEST, SMALLEST, Doubles, ObjectAsset, doubts, footing, pose_of, sized
 from advsearch.scene.geometry import middle, rotation, standing
+from advsearch.scene.grounds import has_lanes
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.parts import Footprint, MeshPart, mesh_part
 from advsearch.scene.places.quads import LAID
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 FARTHEST = 1000.0  # how far from the object a thing may stand, metres
 MOST = 64  # things beside an object
 EYE_SIZE = 1e-3  # half the width of what stands for a camera, object sizes
-OPTIONS = ("heading", "size", "name", "label", "lamps")
+OPTIONS = ("heading", "size", "name", "label", "lamps", "facing")
 ALL = "all"  # what stands for the object and every thing beside it
 TAKEN = ("object", "environment", "ground", "camera", *LAID, ALL)  # what a thing can't be called
 
@@ -49,6 +50,7 @@ class AskedThing:
     name: str = ""  # what it is called in the scene
     label: str | None = None  # what a model should call it; None for what the object of that name is called
     lamps: str = LAMPS[0]  # one of `settings.LAMPS`, of a car
+    facing: str | None = None  # the axis of its file that is its front; None for what its format says
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +95,7 @@ def _asked(part: str) -> AskedThing:
     heading = _number(part, "heading", options["heading"], -3600.0, 3600.0) if "heading" in options else 0.0
     size = _number(part, "size", options["size"], SMALLEST, LARGEST) if "size" in options else None
     name = safe_name(Path(options.get("name") or what.strip().partition("#")[0]))
-    return AskedThing(what.strip(), x, y, heading, size, name, options.get("label"), lamps)
+    return AskedThing(what.strip(), x, y, heading, size, name, options.get("label"), lamps, options.get("facing"))
 
 
 def _number(part: str, name: str, text: str, low: float, high: float) -> float:
@@ -106,10 +108,12 @@ def _number(part: str, name: str, text: str, low: float, high: float) -> float:
     return value
 
 
-def with_things(scene: SceneDescription, text: str | None, load: Callable[[str], ObjectAsset]) -> SceneDescription:
-    """Return the scene with the things beside its object that a text asks for, each loaded by its name or file; what
-    stands in another one is said in its remarks. Raises UnknownNameError: there is no such object. Raises InputError:
-    the text says something else, a name is taken, or sizes in metres are not known."""
+def with_things(
+    scene: SceneDescription, text: str | None, load: Callable[[str, str | None], ObjectAsset]
+) -> SceneDescription:
+    """Return the scene with the things beside its object that a text asks for, each loaded by its name or file and the
+    axis that its front faces; what stands in another one is said in its remarks. Raises UnknownNameError: there is no
+    such object. Raises InputError: the text says something else, a name is taken, or sizes in metres are not known."""
     asked = asked_things(text)
     if not asked:
         return scene
@@ -121,7 +125,7 @@ def with_things(scene: SceneDescription, text: str | None, load: Callable[[str],
     parts, remarks = list[ThingPart](), list[str]()
     for thing in asked:
         what, name = thing.what, thing.name
-        asset = sized(load(what), thing.size, None)
+        asset = sized(load(what, thing.facing), thing.size, None)
         if asset.metres is None:
             example = f"{what}@{thing.x:g},{thing.y:g},size=METRES"
             raise InputError(f"things: the size of {what} in metres is not known; say it: {example}")
@@ -131,6 +135,8 @@ def with_things(scene: SceneDescription, text: str | None, load: Callable[[str],
         looks = {**vars(part), "label": thing.label or asset.label}
         parts.append(ThingPart(**looks, metres=asset.metres, lamps=thing.lamps))
         remarks += [*asset.notes, *doubts(asset, asked=thing.size is not None, laid=True)]
+        if asset.front is not None and asset.front.reason and has_lanes(scene):
+            remarks.append(asset.front.reason)
     scene = replace(scene, parts=(*scene.parts, *parts), things_spec=text or "")
     places = {"the object": footprint(scene.base_vertices)} | {
         name: footprint(standing(part)) for name, part in scene.meshes.items() if isinstance(part, ThingPart)
@@ -185,7 +191,7 @@ def overlapping(one: Footprint, other: Footprint) -> bool:
 
 SOLID_NAMES = {
     "houses": "a house", "posts": "a lamp post", "trees": "the trunk of a tree", "sign-post": "the post of a sign",
-    "walls": "a wall", "furniture": "a piece of furniture",
+    "walls": "a wall", "furniture": "a piece of furniture", "lamp": "the ceiling",
 }  # fmt: skip
 """What the solids of a place's meshes are called."""
 

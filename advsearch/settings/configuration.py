@@ -16,9 +16,10 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
-from advsearch.files import JsonObject, is_shallow, split_paths
+from advsearch.files import JsonObject, split_paths
 from advsearch.settings import values as written
-from advsearch.settings.power import LeftOut, Power, none
+from advsearch.trust.powers import LeftOut, Power, none
+from advsearch.trust.stored_files import is_shallow
 
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
@@ -44,7 +45,7 @@ class Setting:
     metavar: str = ""  # what stands for the value in the help, where that is not the last word of its name
     form: Form = "text"  # how it is written on a command line; what is true or false is a switch
     switched: str = ""  # what the flag does, where that is the opposite of the description
-    power: Power = none  # says what a value does beyond the run, which only a person may ask for (`settings.power`)
+    power: Power = none  # says what a value does beyond the run, which only a person may ask for (`trust.powers`)
     field: str = ""  # its name in the configuration
     name: str = ""  # its name in YAML
     required: bool = False

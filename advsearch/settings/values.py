@@ -16,8 +16,8 @@ from pydantic import ValidationInfo, field_validator
 
 from advsearch.distributions import OwnQuantiles
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import parsed, present_text
-from advsearch.yaml_text import LARGEST, parse_yaml
+from advsearch.trust.stored_files import parsed, present_text
+from advsearch.trust.yaml_text import LARGEST, parse_yaml
 
 LARGEST_WHOLE = 2**63 - 1
 

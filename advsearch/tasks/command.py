@@ -11,13 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch import files
 from advsearch.errors import FileFormatError, InputError
 from advsearch.models import Model
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.guards import WithState
+from advsearch.models.inputs import WithState
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Facts, Prediction, Said, Task
+from advsearch.trust import stored_files
+from advsearch.trust.stored_files import parse_json
 
 Numbers = tuple[float, ...]
 
@@ -241,7 +242,7 @@ def _state(given: Any) -> dict[str, Numbers]:
     if isinstance(given, (str, Path)) and str(given):
         path = Path(given).expanduser()
         try:
-            given = files.parse_json(files.read_text(path, "a state: numbers by name in JSON", LARGEST), finite=True)
+            given = parse_json(stored_files.read_text(path, "a state: numbers by name in JSON", LARGEST), finite=True)
         except OSError as error:
             raise FileFormatError(f"task command: state: {path} cannot be read ({error.strerror or error})") from None
         except ValueError as error:

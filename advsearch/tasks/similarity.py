@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch import files
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
@@ -25,8 +24,9 @@ from advsearch.options import FROM_RUN
 from advsearch.pictures import upright
 from advsearch.tasks.base import Facts, Judgement
 from advsearch.tasks.classification import Classification, Labels
+from advsearch.trust.stored_files import scaled, too_large
 
-MOST = 10_000  # pictures of a gallery, before `advsearch.files.scaled`
+MOST = 10_000  # pictures of a gallery, before `scaled`
 SIDE = 1024  # longest side in pixels of a picture as it is kept; larger ones are averaged down
 AT_ONCE = 16  # pictures that a network is shown at once
 PENALTY = 1e-3  # of the squared weights of a linear head, beside a mean cross-entropy in nats
@@ -81,8 +81,8 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
         if not pictures:
             raise InputError(f"references: expected pictures of {name} in {where}, got none; put some there")
         paths += [(number, picture) for picture in pictures]
-    if len(paths) > files.scaled(MOST):
-        raise files.too_large(root, f"at most {files.scaled(MOST):,} reference pictures", f"{len(paths):,}")
+    if len(paths) > scaled(MOST):
+        raise too_large(root, f"at most {scaled(MOST):,} reference pictures", f"{len(paths):,}")
     parts: list[Tensor] = []
     shown = (_cut(torch.from_numpy(upright(path, SIDE)), model.input_size) for _, path in paths)
     with torch.no_grad():

@@ -6,27 +6,19 @@ its time is up, or for `GRACE` only where others wait.
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import io
-import ipaddress
 import math
 import selectors
 import socket
 import ssl
-import subprocess
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from http import HTTPStatus
-from pathlib import Path
 from queue import Empty, LifoQueue
 from typing import Any
-
-from advsearch.errors import InputError
 
 WORKERS = 16  # requests that are answered at once; others wait
 WAITING = 128
@@ -38,45 +30,8 @@ GRACE = 1.0  # seconds that a slow client has where others wait
 TICK = 0.05  # seconds between two looks at the clock
 
 
-class Refused(Exception):
-    """A request that is not answered as asked."""
-
-    def __init__(self, status: HTTPStatus, text: str) -> None:
-        super().__init__(text)
-        self.status = status
-
-
 LARGEST_SENT = 16 << 20  # bytes of what is sent, at most
 NO_QR = "pip install segno"  # what to type where there is nothing to draw a code with
-DAYS = 7  # for which a certificate is good
-
-
-def https_context(hosts: Sequence[str]) -> tuple[ssl.SSLContext, str]:
-    """Return what speaks HTTPS under some names and addresses, and the SHA-256 fingerprint of its new certificate.
-    Raises InputError where there is no `openssl`, or it makes none."""
-    names = ",".join(f"IP:{host}" if is_address(host) else f"DNS:{host}" for host in dict.fromkeys(hosts))
-    with tempfile.TemporaryDirectory(prefix="advsearch-") as folder:  # mode 0700
-        key, certificate = Path(folder) / "key.pem", Path(folder) / "certificate.pem"
-        key.touch(mode=0o600)
-        command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes"]
-        command += ["-keyout", str(key), "-out", str(certificate), "-days", str(DAYS), "-subj", "/CN=advsearch"]
-        command += ["-addext", f"subjectAltName={names}", "-addext", "extendedKeyUsage=serverAuth"]
-        try:
-            subprocess.run(command, check=True, capture_output=True, timeout=30.0, stdin=subprocess.DEVNULL)
-        except FileNotFoundError:
-            raise InputError(
-                "https: needs the program openssl, which makes the certificate; apt-get install openssl, or leave "
-                "`host` and `https` out"
-            ) from None
-        except (OSError, subprocess.SubprocessError) as error:
-            text = (getattr(error, "stderr", None) or b"").decode(errors="replace")[-300:]
-            raise InputError(f"https: openssl made no certificate: {text or error}") from None
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.minimum_version = ssl.TLSVersion.TLSv1_2
-        context.load_cert_chain(certificate, key)
-        data = ssl.PEM_cert_to_DER_cert(certificate.read_text(encoding="ascii"))
-    digest = hashlib.sha256(data).hexdigest().upper()
-    return context, ":".join(digest[place : place + 2] for place in range(0, len(digest), 2))
 
 
 def reachable(host: str) -> str:
@@ -90,15 +45,6 @@ def reachable(host: str) -> str:
             return str(probe.getsockname()[0])
     except OSError:
         return "::1" if host == "::" else "127.0.0.1"
-
-
-def is_address(host: str) -> bool:
-    """Whether a host is a number and no name."""
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
 
 
 @dataclass(eq=False)

@@ -16,8 +16,8 @@ import numpy as np
 
 from advsearch.errors import FileFormatError
 from advsearch.options import OUT_OF_VIEW
-from advsearch.runs.files import DAMAGED
 from advsearch.runs.store import NAME, Row
+from advsearch.trust.databases import DAMAGED
 
 if TYPE_CHECKING:
     import pandas as pd

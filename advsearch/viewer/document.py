@@ -6,11 +6,10 @@ Its style sheet is light and dark, from a phone to a wide screen, and on paper.
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -21,6 +20,7 @@ from advsearch.files import MESHES
 from advsearch.report import wording
 from advsearch.report.shown import Html, element, join_html
 from advsearch.runs.directory import PARTS, REPORT
+from advsearch.trust import pages
 
 MOST_NOTES = 3  # notes on files that are not folded
 
@@ -53,7 +53,7 @@ def document(
     hold `data`, and files of the viewer that run in it, one after the other: one of `SCRIPTS`. It `connects` if it asks
     its server for rows and pictures; else it cannot ask anybody."""
     code = _code(scripts)
-    policy = _policy([_digest(code.encode())] if code else [], connects=connects)
+    policy = pages.page_policy([pages.script_digest(code.encode())] if code else [], connects=connects)
     head = element(
         "head",
         element("meta", charset="utf-8"),
@@ -76,48 +76,20 @@ def _code(scripts: Sequence[str]) -> str:
     return "\n".join(map(asset, scripts))
 
 
-def _digest(code: bytes) -> str:
-    return base64.b64encode(hashlib.sha256(code).digest()).decode()
-
-
 @cache
 def _own_digests() -> frozenset[str]:
-    return frozenset(_digest(_code(scripts).encode()) for scripts in SCRIPTS)
+    return frozenset(pages.script_digest(_code(scripts).encode()) for scripts in SCRIPTS)
 
 
 def has_other_scripts(page: bytes) -> bool:
     """Whether a page has a script that is none of `SCRIPTS`, such as that of another version, and so will not run where
-    `served_policy` holds. Scripts that are data do not count; one pass, as the page may be somebody else's."""
-    end = 0
-    for opening in re.finditer(rb"<script", page, re.IGNORECASE):
-        if opening.start() < end:
-            continue
-        begin = page.find(b">", opening.end()) + 1
-        if not begin:
-            return False
-        close = re.compile(rb"</script", re.IGNORECASE).search(page, begin)
-        end = close.start() if close else len(page)
-        is_data = page.startswith(b' type="application/', opening.end())
-        if not is_data and _digest(page[begin:end]) not in _own_digests():
-            return True
-    return False
-
-
-def _policy(digests: Iterable[str], *, connects: bool) -> str:
-    """What a page may load and run; `digests` are those of its scripts."""
-    images, connect = ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
-    runs = "".join(f" 'sha256-{one}'" for one in sorted(digests))
-    scripts = f"; script-src{runs}" if runs else ""
-    return f"default-src 'none'; img-src {images}; style-src 'unsafe-inline'{scripts}{connect}; base-uri 'none'"
+    `served_policy` holds. Scripts that are data do not count."""
+    return pages.has_other_scripts(page, _own_digests())
 
 
 def served_policy(*, own: bool) -> str:
-    """Return the `Content-Security-Policy` that a server sends. A page that it has made itself may ask its server for
-    more. All else lies in the folder of a run, which may be somebody else's: it gets an origin of its own, so that it
-    can read and send nothing, and runs no script but those of `SCRIPTS`."""
-    sandbox = "form-action 'none'; sandbox allow-scripts allow-popups allow-popups-to-escape-sandbox"
-    closed = "form-action 'self'" if own else sandbox
-    return f"{_policy(_own_digests(), connects=own)}; frame-ancestors 'none'; {closed}"
+    """Return the `Content-Security-Policy` that a server sends, under which no script runs but those of `SCRIPTS`."""
+    return pages.served_policy(_own_digests(), own=own)
 
 
 def in_address(name: str) -> str:

@@ -15,14 +15,16 @@ from typing import TypeVar
 
 from advsearch import registry
 from advsearch.errors import FileFormatError
-from advsearch.files import read_bytes
 from advsearch.report import shown as showing
 from advsearch.report.shown import Html, Picture, ResultPart, ShownResult, element, join_html
 from advsearch.report.wording import is_command
 from advsearch.runs.directory import CONFIG, IMAGES, OBJECT_FILE, REPORT, RunDirectory
-from advsearch.runs.files import smaller_png, write_text
+from advsearch.runs.files import smaller_png
 from advsearch.runs.results import Result
 from advsearch.runs.summary import read_result
+from advsearch.trust.named_files import is_inside
+from advsearch.trust.stored_files import read_bytes
+from advsearch.trust.writing import write_text
 from advsearch.viewer import document
 
 LARGEST_FIGURE = 2_000_000  # bytes of a figure or a picture that the page takes along
@@ -36,7 +38,7 @@ KINDS = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}  # me
 def kept(run: Path, name: str | Path, largest: int = LARGEST_FIGURE) -> Path | None:
     """Return the file of a picture in the folder of a run; None where it is missing, elsewhere or too large."""
     file = run / name
-    inside = file.resolve().is_relative_to(run.resolve()) and file.is_file()  # a summary may name any
+    inside = is_inside(file, run) and file.is_file()  # a summary may name any
     return file if inside and file.stat().st_size <= largest else None
 
 

@@ -12,7 +12,6 @@ and lets no script run but those of this package. A photograph needs the key tha
 from __future__ import annotations
 
 import hmac
-import ipaddress
 import json
 import os
 import re
@@ -29,16 +28,19 @@ from typing import Any, NamedTuple
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from advsearch.errors import AdvsearchError, InputError
-from advsearch.files import read_bytes
 from advsearch.questions.photographs import result as photos
 from advsearch.questions.sweep.page import SweepSource, result_of, sweep_page_html
 from advsearch.report import wording
 from advsearch.report.shown import Html, element, join_html
-from advsearch.runs import directory, files, listing, store
+from advsearch.runs import directory, listing, store
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
 from advsearch.runs.results import plain
+from advsearch.trust.network import https_context, is_local
+from advsearch.trust.pages import CLOSED, LOOPBACK, Refused, check_request, token_cookie
+from advsearch.trust.stored_files import read_bytes
+from advsearch.trust.writing import is_held
 from advsearch.viewer import clients
-from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, Refused, https_context, is_address, reachable
+from advsearch.viewer.clients import PATIENCE, SLOWEST, TICK, Clients, reachable
 from advsearch.viewer.columns import packed, read_columns
 from advsearch.viewer.document import (
     data_script,
@@ -98,7 +100,7 @@ START = 0  # where a page begins: the last row that it has
 
 def is_under_way(run: Path) -> bool:
     """Whether a run has no page that says what came out: none at all, or one of an attack that is being resumed."""
-    return not (run / REPORT).is_file() or (files.is_held(run) and listing.can_resume(run))
+    return not (run / REPORT).is_file() or (is_held(run) and listing.can_resume(run))
 
 
 def following_page(name: str, run: Path) -> str:
@@ -127,7 +129,7 @@ def following_page(name: str, run: Path) -> str:
 def progress_json(run: Path, after: int) -> bytes:
     """Return what is new in a run as JSON, after what `next` was in the answer before, or `START`. Raises
     FileFormatError where what it keeps is damaged."""
-    running, ended = files.is_held(run), not is_under_way(run)  # before what it has: what comes later is asked for
+    running, ended = is_held(run), not is_under_way(run)  # before what it has: what comes later is asked for
     last, rows, pictures = after, list[dict[str, object]](), list[dict[str, object]]()
     if (run / store.NAME).is_file():
         with store.Store(run / store.NAME, read_only=True) as results:
@@ -143,15 +145,12 @@ def progress_json(run: Path, after: int) -> bytes:
     return json.dumps(plain(news), allow_nan=False).encode()
 
 
-LOOPBACK = "127.0.0.1"
 FIRST_PART, PART = 4_000, 50_000
 """Rows of a sweep that goes on that are sent at once; reading more takes longer than somebody waits for the first."""
 LARGEST, LARGEST_PAGE = 1 << 30, 1 << 28  # most bytes of a sweep's columns, and of a page that lies in a run
 SENDING = 60.0  # seconds in which a photograph has to have come
 FAULT = "this page could not be made, which is a fault of advsearch"
 BACKLOG = 4096  # connections that may wait in the operating system
-LONGEST = 4096  # characters of an address
-COOKIE = "advsearch"
 NUMBERED = re.compile(r"[0-9]+/[0-9]{1,12}\.jpg")  # a thousand pictures have a folder
 
 
@@ -180,11 +179,10 @@ class Dashboard(HTTPServer):
             while name in self._given:
                 name, number = f"{path.resolve().name} ({number})", number + 1
             self._given[name] = path
-        here = host == "localhost" or (is_address(host) and ipaddress.ip_address(host).is_loopback)
-        self.token = None if here else secrets.token_urlsafe(24)
+        self.token = None if is_local(host) else secrets.token_urlsafe(24)
         self._secret, self.photographs = secrets.token_bytes(32), photographs
         self._listing = threading.Lock()
-        self._host, self.fingerprint = host, None
+        self.named, self.fingerprint = host, None
         self._context: ssl.SSLContext | None = None
         if https or self.token:
             self._context, self.fingerprint = https_context((reachable(host), "localhost", LOOPBACK))
@@ -207,7 +205,7 @@ class Dashboard(HTTPServer):
 
     def address_of(self, path: str) -> str:
         """What to open in a browser, here or elsewhere, to see a page."""
-        host = reachable(self._host)
+        host = reachable(self.named)
         host = f"[{host}]" if ":" in host else host
         return f"{self.scheme}://{host}:{self.server_port}{path}" + (f"?token={self.token}" if self.token else "")
 
@@ -288,11 +286,7 @@ class _Handler(BaseHTTPRequestHandler):
             "Content-Length": str(len(served.data)),
             "Content-Security-Policy": served.policy,
             "Cache-Control": "no-store",
-            "X-Content-Type-Options": "nosniff",
-            "X-Frame-Options": "DENY",
-            "Referrer-Policy": "no-referrer",
-            "Cross-Origin-Resource-Policy": "same-origin",
-            "Permissions-Policy": "camera=(self), microphone=(), geolocation=()",
+            **CLOSED,
             **headers,
         }.items():
             self.send_header(name, value)
@@ -304,34 +298,10 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_POST = do_GET
 
     def _check(self) -> None:
-        if len(self.path) > LONGEST:
-            raise Refused(HTTPStatus.REQUEST_URI_TOO_LONG, "the address is too long")
-        host = self.headers.get("Host", "")
-        if not self._is_own(host):
-            raise Refused(HTTPStatus.FORBIDDEN, "this server is not called so; open the address that it printed")
-        origin = self.headers.get("Origin")
-        if origin is not None and origin != f"{self.server.scheme}://{host}":
-            raise Refused(HTTPStatus.FORBIDDEN, "a page of another origin asks; open the address that was printed")
-        if self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
-            if self.headers.get("Sec-Fetch-Mode") != "navigate" or self.command == "POST":
-                raise Refused(HTTPStatus.FORBIDDEN, "a page of another site asks")
-        if (token := self.server.token) is not None:
-            given = parse_qs(urlsplit(self.path).query).get("token", [])
-            for part in self.headers.get("Cookie", "").split(";"):
-                name, _, value = part.strip().partition("=")
-                if name == f"{COOKIE}-{self.server.server_port}":
-                    given.append(value)
-            if not any(hmac.compare_digest(token, one) for one in given if one.isascii()):
-                raise Refused(HTTPStatus.UNAUTHORIZED, "the token is missing; open the address that was printed")
-
-    def _is_own(self, host: str) -> bool:
-        """Whether a request's Host is an address of this server: a name would need a name server to lead here."""
-        name, _, port = host.rpartition(":")
-        if not port.isdecimal() or int(port) != self.server.server_port:
-            return False
-        if self.server.token is None:
-            return name in ("localhost", LOOPBACK, "[::1]")
-        return name in ("localhost", self.server._host) or is_address(name.removeprefix("[").removesuffix("]"))
+        server = self.server
+        check_request(
+            self.command, self.path, self.headers, server.scheme, server.named, server.server_port, server.token
+        )
 
     def _served(self) -> tuple[Served, dict[str, str]]:
         if not self.path.startswith("/"):
@@ -340,9 +310,7 @@ class _Handler(BaseHTTPRequestHandler):
         query = parse_qs(address.query, errors="surrogateescape")
         headers = {}
         if self.server.token and "token" in query:
-            # Lax: a link on the page of a run, which has an origin of its own, leads back to the list
-            cookie = f"{COOKIE}-{self.server.server_port}={self.server.token}"
-            headers["Set-Cookie"] = f"{cookie}; HttpOnly; Secure; SameSite=Lax; Path=/"
+            headers["Set-Cookie"] = token_cookie(self.server.server_port, self.server.token)
         # names of files may be no text
         parts = [unquote(part, errors="surrogateescape") for part in address.path.split("/")[1:]]
         return self._answer(query, parts), headers
@@ -403,7 +371,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not after and (run / COLUMNS).is_file() and listing.finished(run):
             return Served("application/octet-stream", read_bytes(run / COLUMNS, "columns of a sweep", LARGEST))
         part = PART if after else FIRST_PART
-        running = files.is_held(run)  # before the rows are read: what comes later is asked for again
+        running = is_held(run)  # before the rows are read: what comes later is asked for again
         columns = read_columns(run, after, part)
         return Served("application/octet-stream", packed(columns, more=len(columns) == part, running=running))
 

@@ -16,10 +16,11 @@ import numpy as np
 from PIL import Image
 
 from advsearch.errors import FileFormatError
-from advsearch.files import read_bytes
 from advsearch.runs.directory import CONFIG, IMAGES, SMALL_PICTURES
-from advsearch.runs.files import BAD_PICTURE, Bytes, to_8bit, write_bytes
+from advsearch.runs.files import BAD_PICTURE, Bytes, to_8bit
 from advsearch.settings import read_yaml, split_names
+from advsearch.trust.stored_files import read_bytes
+from advsearch.trust.writing import write_bytes
 
 if TYPE_CHECKING:
     import pandas as pd

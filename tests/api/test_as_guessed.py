@@ -28,7 +28,6 @@ from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNam
 from advsearch.progress import BarProgress, LineProgress, NotebookProgress, NullProgress, watched
 from advsearch.questions.attack.result import AttackResult
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.gap import GapResult
 from advsearch.questions.region.result import RegionResult
 from advsearch.questions.sweep.result import SweepResult
 from advsearch.runs.results import Result
@@ -102,9 +101,6 @@ def test_every_other_question_does_too(scene: advsearch.Scene, model: advsearch.
     )
     again = advsearch.load_run(tmp_path / "sweep")
     assert isinstance(again, SweepResult) and again.summary == swept.summary and [*again.rows()] == [*swept.rows()]
-    gap = advsearch.gap(scene, model, controls="pose.yaw", average=6, policy="random", run=tmp_path / "gap", **FAST)
-    again = advsearch.load_run(tmp_path / "gap")
-    assert isinstance(again, GapResult) and again == gap and "PNG" in repr(again._repr_png_())
     few = {**PICTURE, "samples": 8, "map": 0, "verify_spp": 1}
     del few["spp"]
     region = advsearch.region(scene, model, controls="pose.yaw", run=tmp_path / "region", **few)
@@ -384,8 +380,10 @@ def test_a_mapping_may_have_instances(scene: advsearch.Scene) -> None:
 @pytest.mark.parametrize("key", ["task", "objective", "policy"])
 def test_what_a_question_takes_by_name_alone_it_says(key: str) -> None:
     given: dict[str, Any] = {key: lambda output, truth: output}
-    with pytest.raises(InputError, match=f"^{key}: expected a name for gap, got <function .*; `attack` takes your own"):
-        advsearch.gap("mug", **given)
+    with pytest.raises(
+        InputError, match=f"^{key}: expected a name for harden, got <function .*; `attack` takes your own"
+    ):
+        advsearch.harden("mug", **given)
 
 
 def test_a_detector_is_told_what_it_is() -> None:
@@ -398,15 +396,14 @@ def test_a_detector_is_told_what_it_is() -> None:
 def test_a_loaded_scene_is_asked_about_as_it_is(model: advsearch.Model, tmp_path: Path) -> None:
     turned = advsearch.load_scene("mug", settings={"pose.yaw": 77.0})
     asked: dict[str, Any] = {**FAST, "steps": 1, "average": 6, "policy": "random"}
-    gap = advsearch.gap(turned, model, controls="pose.pitch", run=tmp_path / "gap", **asked)
-    assert gap.command_line == "No command repeats this: the model bright exists only in the Python session that asked."
-    part = advsearch.load_run(tmp_path / "gap" / "parts" / gap.parts[0])
-    assert isinstance(part, AttackResult) and part.summary.command_line == gap.command_line
-    assert "pose.yaw: 77.0" in (tmp_path / "gap" / "run.yaml").read_text("utf-8")
+    attacked = advsearch.attack(turned, model, controls="pose.pitch", run=tmp_path / "attack", **asked)
+    said = "No command repeats this: the model bright exists only in the Python session that asked."
+    assert attacked.summary.command_line == said
+    assert "pose.yaw: 77.0" in (tmp_path / "attack" / "run.yaml").read_text("utf-8")
     with pytest.raises(InputError, match="environment: belongs to the scene, and a loaded scene was given"):
         advsearch.region(turned, model, environment="noon")
     with pytest.raises(InputError, match="workers: other processes load objects, models"):
-        advsearch.gap(turned, model, workers=2)
+        advsearch.attack(turned, model, workers=2)
 
 
 # ---- what is shown --------------------------------------------------------------------------------------------------

@@ -175,7 +175,7 @@ def test_what_cannot_be_written_is_said(swept: Path, tmp_path: Path, capsys: pyt
     assert "not empty" in refused(run)
     (tmp_path / "out" / "mine").unlink()
     with RunDirectory.create(tmp_path / "other") as other:
-        (other.path / "run.yaml").write_text("# advsearch run configuration\nschema: 2\ncommand: gap\n")
+        (other.path / "run.yaml").write_text("# advsearch run configuration\nschema: 2\ncommand: region\n")
     assert "expected a run of sweep or attack" in refused(tmp_path / "other")
     with closing(sqlite3.connect(run / NAME)) as rows, rows:
         before = rows.execute("SELECT MAX(step) FROM evaluations").fetchone()

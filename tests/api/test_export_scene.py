@@ -141,7 +141,7 @@ def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: 
 
     read = trimesh.load(out, process=False, force="mesh")
     metres = world * description.object.metres  # glTF is in metres
-    np.testing.assert_allclose(read.vertices[:, [0, 2, 1]] * (1, -1, 1), metres, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(read.vertices[:, [2, 0, 1]], metres, rtol=1e-6, atol=1e-9)
     np.testing.assert_array_equal(read.faces, own.mesh.faces)
     np.testing.assert_allclose(read.visual.uv, own.mesh.uvs, atol=1e-6)
     np.testing.assert_array_equal(np.array(read.visual.material.baseColorTexture)[..., :3], texture)
@@ -167,7 +167,7 @@ def test_the_object_to_turn_is_the_adversarial_scene_and_what_was_before(run: Pa
         write_object(kept, answer.problem, answer.u)
     read = trimesh.load(tmp_path / "kept" / OBJECT_FILE, process=False, force="mesh")
     world = answer.inputs["object.vertices"].numpy()
-    np.testing.assert_array_equal(read.vertices[: len(world), [0, 2, 1]] * (1, -1, 1), world)
+    np.testing.assert_array_equal(read.vertices[: len(world), [2, 0, 1]], world)
     header = json.loads(
         (tmp_path / "kept" / OBJECT_FILE).read_bytes()[20:].partition(b"\0")[0].rpartition(b"}")[0] + b"}"
     )
@@ -175,6 +175,6 @@ def test_the_object_to_turn_is_the_adversarial_scene_and_what_was_before(run: Pa
     assert len(header["bufferViews"]) == 2 * 2 + 2 + 2  # places, normals and textures differ, the rest is there once
     camera = next(one["matrix"] for one in header["nodes"] if "camera" in one)
     x, y, z = answer.inputs["camera.to_world"][:3, 3].tolist()
-    np.testing.assert_allclose(camera[12:15], [x, z, -y], atol=1e-6)
+    np.testing.assert_allclose(camera[12:15], [y, z, x], atol=1e-6)
     away = np.array(camera[12:15]) - read.vertices[: len(world)].mean(axis=0)
     assert float(np.dot(away, camera[8:11])) > 0.9 * float(np.linalg.norm(away))  # it looks at the object

@@ -24,7 +24,7 @@ from advsearch.questions.attack import studies as parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import models_worker
 from advsearch.questions.attack.summary import MatrixResult
-from advsearch.questions.gap import GapConfig
+from advsearch.questions.region.result import RegionConfig
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
 from advsearch.tasks import Classification
@@ -104,7 +104,7 @@ def test_workers_make_the_pictures_of_the_trials(
     run = tmp_path / "run"
     config = AttackConfig(**{**SHORT, "model": BOTH, "run": str(run)})
     ready = shared(monkeypatch, config.plain(), models_worker)
-    monkeypatch.setattr(parts, "executor_of", lambda work, **_: nullcontext(None))
+    monkeypatch.setattr(parts, "open_workers", lambda work, **_: nullcontext(None))
     result = carried_out(run, workers=2)
     assert isinstance(result, MatrixResult) and len(ready.given) == 3 * 2 * 6
     assert rows(run) == rows(Path(str(whole.run)))
@@ -142,9 +142,9 @@ def test_what_does_not_go_with_several_models_is_refused(more: dict[str, Any], m
         AttackConfig(**{"object": "mug", "model": "a.pt2,b.pt2", **more})
 
 
-def test_a_gap_has_one_model() -> None:
+def test_a_region_has_one_model() -> None:
     with pytest.raises(InputError, match="model: expected one model, got a,b"):
-        GapConfig(object="mug", model="a,b")
+        RegionConfig(object="mug", model="a,b")
 
 
 @pytest.mark.parametrize(

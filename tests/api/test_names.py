@@ -36,7 +36,7 @@ sweep --object mug --control camera --samples 4 --label mug --model refrence 're
 harden --control textur --quick                                             'texture'
 harden --object mgu --control texture                                       'mug'
 harden --control texture --held-out-environment noonn                       'noon'
-gap --object mug --control poze                                             'pose'
+region --object mug --control poze                                          'pose'
 explain mug-sweep-01                                                        'mug-sweep-001'
 compare mug-swep-001 mug-sweep-001                                          'mug-sweep-001'
 test sute.yaml                                                              suite.yaml

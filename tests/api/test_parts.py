@@ -9,19 +9,18 @@ from typing import Any
 
 import pytest
 
-from advsearch.cluster import Done, Work, Workforce
+from advsearch.cluster import BatchResult, WorkerStats, WorkerTask
 from advsearch.errors import ClusterError
 from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack import studies as parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import chains_of, curve
-from advsearch.questions.gap import GapConfig, gap
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.summary import read_configuration
 
-SMALL = GapConfig(
-    object="mug",
-    controls={"pose": {"yaw": [-30, 30]}, "camera.azimuth": {}},
+SMALL = AttackConfig(
+    object="mug,bowl",
+    controls={"pose": {"yaw": [-30, 30]}},
     policy="random",
     resolution=16,
     denoise="none",
@@ -38,24 +37,24 @@ SMALL = GapConfig(
 class Backwards:
     """Carries out the last range first, in this process; `lost` says of what it dies."""
 
-    facts = Workforce(workers=1)
+    facts = WorkerStats(workers=1)
 
-    def __init__(self, work: Work, lost: str) -> None:
+    def __init__(self, work: WorkerTask, lost: str) -> None:
         self.call, self.lost = parts.attacks_of(work.settings), lost
         assert work.function == "advsearch.questions.attack.studies:attacks_of"
 
-    def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+    def results(self, ranges: Iterable[range]) -> Iterator[BatchResult]:
         for one in reversed(list(ranges)):
-            yield Done(one, None if self.lost else self.call(one), "elsewhere", lost=self.lost)
+            yield BatchResult(one, None if self.lost else self.call(one), "elsewhere", lost=self.lost)
 
 
 def elsewhere(monkeypatch: pytest.MonkeyPatch, lost: str = "") -> None:
     @contextmanager
-    def opened(work: Work, **asked: Any) -> Iterator[Any]:
+    def opened(work: WorkerTask, **asked: Any) -> Iterator[Any]:
         assert (asked["workers"], asked["cluster"]) in ((2, None), (None, None))
         yield None if asked["workers"] is None else Backwards(work, lost)
 
-    monkeypatch.setattr(parts, "executor_of", opened)
+    monkeypatch.setattr(parts, "open_workers", opened)
 
 
 def rows(path: Path) -> list[Any]:
@@ -63,13 +62,14 @@ def rows(path: Path) -> list[Any]:
         return [{**vars(row), "seconds": None, "time": None} for row in store.rows()]
 
 
-def test_a_shared_gap_is_the_one_that_was_made_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = gap.run(SMALL.model_copy(update={"run": str(tmp_path / "alone")}))
+def test_a_shared_study_is_the_one_that_was_made_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = run_and_save(curve, RunContext(SMALL.model_copy(update={"run": str(tmp_path / "alone")})))
     elsewhere(monkeypatch)
-    shared = gap.run(SMALL.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
-    assert [(one.control, one.ending, one.margin) for one in shared.table] == [
-        (one.control, one.ending, one.margin) for one in alone.table
+    shared = run_and_save(curve, RunContext(SMALL.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2})))
+    assert [(row.object, row.ending, row.margin, row.average) for row in shared.table] == [
+        (row.object, row.ending, row.margin, row.average) for row in alone.table
     ]
+    assert [row.average and row.average.configurations for row in shared.table] == [6, 6]
     for name in (part.name for (part,) in chains_of(SMALL)):
         here, there = (tmp_path / one / "parts" / name for one in ("alone", "shared"))
         assert rows(there) == rows(here) and (read_configuration(there) == read_configuration(here)).all()
@@ -82,26 +82,23 @@ def test_an_attack_of_which_every_worker_dies_ends_the_study_by_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     elsewhere(monkeypatch, lost="no answer: 3 workers died of it")
-    with pytest.raises(ClusterError, match=r"mug with camera.azimuth: no answer: 3 workers died of it; leave it out"):
-        gap.run(SMALL.model_copy(update={"run": str(tmp_path / "run"), "workers": 2}))
+    with pytest.raises(ClusterError, match=r"^bowl: no answer: 3 workers died of it; leave it out"):
+        run_and_save(curve, RunContext(SMALL.model_copy(update={"run": str(tmp_path / "run"), "workers": 2})))
 
 
-def test_a_gap_is_every_object_with_every_control() -> None:
-    found = [part for (part,) in chains_of(SMALL.model_copy(update={"object": "mug,bowl", "workers": 2}))]
-    assert [part.name for part in found] == [
-        "00-00-mug-pose",
-        "00-01-mug-camera-azimuth",
-        "01-00-bowl-pose",
-        "01-01-bowl-camera-azimuth",
-    ]
+def test_a_study_is_an_attack_for_every_object() -> None:
+    found = [part for (part,) in chains_of(SMALL.model_copy(update={"workers": 2}))]
+    assert [part.name for part in found] == ["00-mug", "01-bowl"]
     assert all(part.config.run is None and part.config.workers is None for part in found)
-    assert [len(part.config.controls) for part in found] == [1] * 4
+    assert [part.config.average for part in found] == [6, 6]
 
 
 def test_a_shared_curve_tries_no_epsilon_more_than_one_that_was_made_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    small = AttackConfig.of(SMALL, controls={"texture": {"resolution": 2}}, epsilon="0.02,0.01", average=0)
+    small = AttackConfig.of(
+        SMALL, object="mug", controls={"texture": {"resolution": 2}}, epsilon="0.02,0.01", average=0
+    )
     alone = run_and_save(curve, RunContext(small.model_copy(update={"run": str(tmp_path / "alone")})))
     elsewhere(monkeypatch)
     shared = run_and_save(curve, RunContext(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2})))

@@ -23,7 +23,7 @@ def test_dir_lists_the_public_names() -> None:
 
 
 QUESTIONS = (
-    *("attack", "sweep", "gap", "region", "replay", "recipe", "check", "precision", "stability", "harden"),
+    *("attack", "sweep", "region", "replay", "recipe", "check", "precision", "stability", "harden"),
     *("explain", "compare"),
 )
 
@@ -62,8 +62,8 @@ def test_signatures_have_every_setting_as_it_is_declared(name: str) -> None:
 
 def test_editors_and_type_checkers_know_every_setting() -> None:
     """Each comment would be one too many, and mypy would say so, if a keyword had no type."""
-    with pytest.raises(InputError, match=r"^steps: expected a whole number from 1 to 1000000, got many"):
-        advsearch.gap("mug", steps="many")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"^samples: expected a whole number from 8 to 1000000, got many"):
+        advsearch.region("mug", samples="many")  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"^loss: expected linear, model or both, got square"):
         advsearch.check(loss="square")  # type: ignore[arg-type]
     with pytest.raises(TypeError, match=r"stability\(\) got an unexpected keyword argument 'object'"):
@@ -129,13 +129,7 @@ def test_rows_become_a_table_of_pandas(attacked: Any, swept: advsearch.SweepResu
     assert len(searched) and set(searched["kind"]) == {"search"} and len(attacked.to_pandas()) > len(searched)
 
 
-def test_the_gap_is_asked_for_by_name(tmp_path: Path) -> None:
-    quick: dict[str, Any] = {"resolution": 16, "spp": 1, "verify_spp": 1, "steps": 2, "trials": 6, "average": 6}
-    found = advsearch.gap(
-        "mug", controls=["camera"], policy="random", baseline=False, run=tmp_path / "run", threads=1, **quick
-    )
-    assert [(row.object, row.control) for row in found.table] == [("mug", "camera")]
-    assert found.table[0].average.configurations == 6
+def test_a_region_is_asked_for_by_name() -> None:
     with pytest.raises(InputError, match=r"^map: expected a whole number from 0 to 512, got 600"):
         advsearch.region("mug", controls="camera", map=600)
 

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import torch
-from conftest import ROOT
+from mobilenet import MobileNetV2
 from torch import nn
 
 import advsearch
 
 
 def mobilenet() -> nn.Module:
-    spec = importlib.util.spec_from_file_location("mobilenet", ROOT / "benchmarks" / "_mobilenet.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        made: nn.Module = module.MobileNetV2()
+        made: nn.Module = MobileNetV2()
     return made.eval()
 
 

@@ -91,7 +91,7 @@ def test_a_person_reads_what_was_written_and_what_the_model_sees(
     assert main(["render", "--object", "mug", "--out", str(out), *SMALL]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"{out}: 16 x 16 pixels" and "Model reference sees" in lines
-    assert len(lines) == 3 + 5 and lines[-1].endswith(" %")
+    assert len(lines) == 3 + 5 + 2 and lines[7].endswith(" %") and lines[-1].split() == ["environment", "studio"]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ conditions that are rendered."""
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,10 +23,10 @@ from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.experiment import RunContext, run_and_save, run_experiment
 from advsearch.questions.attack import carry_out as attacking
+from advsearch.questions.attack.display import claims
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.gap import GapConfig, gap
 from advsearch.questions.region import growing, region
 from advsearch.questions.region.result import RegionConfig
 from advsearch.runs.directory import RunDirectory
@@ -111,7 +112,7 @@ def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConf
 def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     asked: list[AttackConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = GapConfig(object="mug,bowl", controls="texture,geometry", run="study")
+    config = AttackConfig(object="mug,bowl,vase,pan", average=50, run="study")
     carry_out: Callable[..., Any] = vars(attacking)["attack_once"]  # the stand-in
 
     def stopped(config: AttackConfig, *, progress: Any, clean: CleanMatrix | None = None) -> Any:
@@ -121,25 +122,23 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
 
     monkeypatch.setattr(attacking, "attack_once", stopped)
     with pytest.raises(KeyboardInterrupt):
-        gap.run(config)
-    assert Path("runs/study/parts/00-00-mug-texture/summary.json").is_file()
+        run_and_save(curve, RunContext(config))
+    assert Path("runs/study/parts/00-mug/summary.json").is_file()
     monkeypatch.setattr(attacking, "attack_once", carry_out)
-    summary = gap.run(config, resumed=Path("runs/study"))
-    assert [(row.object, row.control) for row in summary.table] == [
-        ("mug", "texture"), ("mug", "geometry"), ("bowl", "texture"), ("bowl", "geometry"),
-    ]  # fmt: skip
+    summary = run_and_save(curve, RunContext(config, resumed=Path("runs/study")))
+    assert [row.object for row in summary.table] == ["mug", "bowl", "vase", "pan"]
     assert len(asked) == 4, "two before the stop, two after it"
     assert "45/50 (90 %)" in text_of(summary) and "20/20" in text_of(summary)
 
 
-def test_a_gap_gives_each_control_its_own_budget(asked: list[AttackConfig]) -> None:
-    config = GapConfig(object="mug", controls="texture,pose", epsilon="texture=0.05", run="study", average=7)
-    gap.run(config)
-    assert [(one.epsilon, one.average, list(one.controls)) for one in asked] == [
-        ({"texture": 0.05}, 7, ["texture"]), (None, 7, ["pose"]),
-    ]  # fmt: skip
-    with pytest.raises(InputError, match="epsilon: several make a curve"):
-        gap.run(GapConfig(object="mug", epsilon="0.1,0.2", run="other"))
+def test_the_average_stands_beside_the_worst_case_of_each_object(asked: list[AttackConfig]) -> None:
+    summary = run_and_save(curve, RunContext(AttackConfig(object="mug,bowl", average=50, run="study")))
+    assert [one.average for one in asked] == [50, 50]
+    assert [row.average and row.average.correct for row in summary.table] == [45, 45]
+    text = text_of(summary)
+    assert "right on average" in text and len(re.findall(r"45/50 \(90 %\) +78-97 %", text)) == 2
+    named = [claim.statement for claim in claims(summary) if "drawn by chance" in claim.statement]
+    assert [text.partition(":")[0] for text in named] == ["mug", "bowl"]
 
 
 # ---- rendered -------------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from advsearch.attacks import (
     search,
     verify,
 )
-from advsearch.attacks.trials import MarginsOf, most_samples, paired_difference, trial_seed
+from advsearch.attacks.trials import MarginsOf, most_samples, trial_seed
 from advsearch.attacks.verification import (
     EASIER,
     LEAST_RATE,
@@ -44,6 +44,7 @@ from advsearch.questions.attack.settings import FEWEST_TRIALS
 from advsearch.questions.region.growing import GrownBox
 from advsearch.questions.region.result import FEWEST_SAMPLES
 from advsearch.seeds import stream
+from advsearch.statistics.paired import paired_difference
 from advsearch.tasks import Judgement, Prediction
 
 STUDY = Path(__file__).resolve().parents[2] / "benchmarks" / "verdicts.py"

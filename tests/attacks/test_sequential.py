@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from advsearch.attacks.trials import STAKES, ConfidenceSequence, capital, draws_needed
 from advsearch.errors import InputError
+from advsearch.statistics.sequential import STAKES, ConfidenceSequence, capital, draws_needed
 
 STUDY = Path(__file__).resolve().parents[2] / "benchmarks" / "sequential.py"
 

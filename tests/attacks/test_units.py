@@ -9,19 +9,19 @@ import numpy.typing as npt
 import pytest
 from scipy.stats import fisher_exact
 
-from advsearch.attacks.trials import (
-    ConfidenceSequence,
-    clopper_pearson,
+from advsearch.errors import InputError
+from advsearch.statistics.clustered import (
     fewer_by_chance,
-    mcnemar,
     mean_interval,
+    mean_share,
     most_shown,
     paired_by_unit,
-    paired_difference,
     per_unit,
     share_interval,
 )
-from advsearch.errors import InputError
+from advsearch.statistics.intervals import clopper_pearson
+from advsearch.statistics.paired import mcnemar, paired_difference
+from advsearch.statistics.sequential import ConfidenceSequence
 
 FRAMES = 8
 
@@ -120,3 +120,72 @@ def test_a_rule_that_is_none_is_told_in_one_of_100_and_a_clear_one_always(side: 
     assert sum(fewer(rng, side, count, 0.0) <= 0.01 for count in (6, 12, 40) for _ in range(100)) <= 9
     assert sum(fewer(rng, side, 60, 0.6) <= 0.01 for _ in range(20)) == 20
     assert fewer_by_chance([1, 2], [8, 8], [0, 0], [0, 0]) == 1.0, "nothing is elsewhere"
+
+
+# ---- units of unequal size -------------------------------------------------------------------------------------------
+
+LARGE = 12  # predictions of the units that have many
+
+
+def unequal(
+    rng: np.random.Generator, count: int, rare: float, small: float, large: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Right predictions and predictions of units: most have one, right by a chance `small`; some have many, each right
+    by a chance `large`: frames of drives in which the object is out of view in most."""
+    is_large = rng.random(count) < rare
+    of = np.where(is_large, LARGE, 1)
+    return rng.binomial(of, np.where(is_large, large, small)), of
+
+
+@pytest.mark.parametrize(("rare", "small", "large"), [(0.1, 1.0, 0.0), (0.1, 0.9, 0.2), (0.5, 0.3, 0.9)])
+@pytest.mark.parametrize("count", [3, 5, 10, 30])
+def test_the_interval_over_units_of_unequal_size_covers_their_mean(
+    count: int, rare: float, small: float, large: float
+) -> None:
+    """The largest unit may not be among those that were seen."""
+    rng, truth = np.random.default_rng(count), (1 - rare) * small + rare * large
+    covered, runs = 0, 300
+    for _ in range(runs):
+        counted, of = unequal(rng, count, rare, small, large)
+        low, high = share_interval(counted, of)
+        covered += low <= truth <= high
+        assert low <= mean_share(counted, of) <= high
+    assert covered >= 0.94 * runs
+
+
+def test_all_units_weigh_the_same() -> None:
+    assert mean_share([1, 3, 0], [1, 12, 0]) == pytest.approx((1.0 + 0.25) / 2)
+    units = np.repeat([0, 1], [1, 12])
+    first, second = np.arange(13) < 1, np.arange(13) > 6
+    difference, (low, high), p = paired_by_unit(first, second, units)
+    assert difference == pytest.approx((0.0 - 1.0 + 0.5 - 0.0) / 2) and low < difference < high and p > 0.05
+    assert paired_by_unit(first, second, np.zeros(13, np.int64))[2] == 1.0, "one unit shows nothing"
+
+
+@pytest.mark.parametrize("count", [5, 12, 30])
+def test_two_models_as_good_over_units_of_unequal_size_are_told_apart_in_5_of_100_at_most(count: int) -> None:
+    """One gains where much is seen, which is rare, and loses as much over all units where little is."""
+    rng, told, missed, runs = np.random.default_rng(count), 0, 0, 300
+    for _ in range(runs):
+        is_large = rng.random(count) < 0.1
+        units = np.repeat(np.arange(count), np.where(is_large, LARGE, 1))
+        is_gain = is_large[units]
+        second = np.where(is_gain, True, rng.random(len(units)) < 8.0 / 9.0)
+        first = np.where(is_gain, False, True)
+        _, (low, high), p = paired_by_unit(first, second, units)
+        told, missed = told + (p <= 0.05), missed + (not low <= 0.0 <= high)
+    assert told <= 0.06 * runs and missed <= 0.06 * runs
+
+
+@pytest.mark.parametrize("is_cut", [False, True])
+@pytest.mark.parametrize("count", [6, 12, 40])
+def test_a_rule_of_no_effect_on_the_mean_of_unequal_units_is_told_in_2_of_100_at_most(count: int, is_cut: bool) -> None:
+    """Under the rule units have one prediction more often, which says little of each; the mean over units is alike."""
+    rng, told, runs = np.random.default_rng(count), 0, 400
+    for _ in range(runs):
+        is_under = rng.random(count) < 0.4
+        of = np.where(rng.random(count) < np.where(is_under, 0.8, 0.2), 1, LARGE)
+        inside = np.where(is_under, of, 0)
+        outside = np.where(is_under, LARGE if is_cut else 0, of)
+        told += fewer_by_chance(rng.binomial(inside, 0.7), inside, rng.binomial(outside, 0.7), outside) <= 0.01
+    assert told <= 0.02 * runs

@@ -34,7 +34,6 @@ from advsearch.errors import InputError, StorageError
 from advsearch.options import Value
 from advsearch.progress import BarProgress, LineProgress, NullProgress, Progress, watched
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.gap import GapConfig
 from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
@@ -404,7 +403,7 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
         (
             "object: mug\ncommand: atack\n",
             [],
-            "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, compare, explain, gap, harden, ",
+            "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, compare, explain, harden, ",
         ),
         ("object: mug\n", ["steps"], "change 'steps': expected NAME=VALUE such as camera.azimuth=130, got 'steps'"),
         ("object: mug\n", ["step=3"], "unknown setting 'step'. Did you mean 'steps'"),
@@ -457,39 +456,13 @@ def test_several_objects_or_epsilons_are_a_curve(
     assert json.loads(capsys.readouterr().out) == samples.curve().to_dict()
 
 
-def test_gap_builds_its_configuration_and_prints_a_row_for_each_control(
-    api: Callable[..., None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    given: list[Any] = []
-    api(noting(given, samples.gap()))
-    argv = ["gap", "--object", "mug,bowl", "--control", "pose,light", "--average", "50", "--run", "x", "--quiet"]
-    assert main(argv) == 0
-    assert given == [GapConfig(object="mug,bowl", controls={"pose": {}, "light": {}}, average=50, run="x")]
-    assert capsys.readouterr().out == (
-        "The model is right in 75 % of random configurations, yet one is found that it gets wrong.\n\n"
-        "The worst case beside the average\n"
-        "  object   control   right on average   95 % interval   worst: wrong   margin   ending\n"
-        "  mug      pose      150/200 (75 %)     35-97 %         20/20          3.25     found\n\n"
-        "Margin: how far the right prediction leads the wrong one, in logits, in the trials of the worst case.\n\n"
-        "  model         reference\n"
-        "  policy        auto\n"
-        "  environment   studio\n"
-        "  time          9.0 s\n"
-        "  seed          0\n"
-        "  page          runs/mug-pose-001/report.html\n"
-    )
-
-
-@pytest.mark.parametrize(("command", "summary"), [("gap", samples.gap), ("attack", samples.curve)])
-def test_an_interrupted_study_says_how_to_go_on(
-    api: Callable[..., None], capsys: pytest.CaptureFixture[str], command: str, summary: Any
-) -> None:
-    answer = summary(ending="interrupted")
+def test_an_interrupted_study_says_how_to_go_on(api: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
+    answer = samples.curve(ending="interrupted")
     api(lambda config, progress, resumed: answer)
-    assert main([command, "--object", "mug,bowl"]) == 130
+    assert main(["attack", "--object", "mug,bowl"]) == 130
     assert capsys.readouterr().out.endswith(
         f"\n\nNote: Not finished: these are the results so far.\n\n"
-        f"Go on with: advsearch resume {Path(answer.run).name}\n"
+        f"Go on with: advsearch resume {Path(str(answer.run)).name}\n"
     )
 
 
@@ -588,7 +561,6 @@ def test_sweep_builds_its_configuration_and_passes_its_ending_on(
     [
         (AttackConfig(object="mug", steps=9), SUMMARY),
         (AttackConfig(object="mug", epsilon=(0.1, 0.2)), samples.curve()),
-        (GapConfig(object="mug", average=9), samples.gap()),
         (RegionConfig(object="mug", samples=9), samples.region()),
         (SweepConfig(object="mug", grid={"pose.yaw": [1, 2]}), samples.sweep()),
     ],
@@ -624,7 +596,6 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         (AttackConfig(object="mug", run="stopped"), SUMMARY),
         (AttackConfig(object="mug,bowl", run="stopped"), samples.curve()),
-        (GapConfig(object="mug", run="stopped"), samples.gap()),
         (RegionConfig(object="mug", run="stopped"), samples.region()),
         (SweepConfig(object="mug", grid={"pose.yaw": [1, 2]}, run="stopped"), samples.sweep()),
     ],
@@ -845,6 +816,12 @@ def test_show_control(capsys: pytest.CaptureFixture[str]) -> None:
     assert "unknown control 'camra'. Did you mean 'camera'?" in capsys.readouterr().err
 
 
+def test_show_says_that_rows_may_be_read_from_the_bottom(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["show", "control", "path"]) == 0
+    (rolling,) = [line for line in capsys.readouterr().out.splitlines() if line.split()[:1] == ["rolling"]]
+    assert "-60 to 60" in rolling
+
+
 def test_show_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
     make_run(tmp_path / "runs" / "first", pictures=False, rows=False)
@@ -857,12 +834,11 @@ def test_show_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
 @pytest.mark.parametrize(
     ("summary", "first"),
     [
-        (samples.gap(), "The model is right in 75 % of random configurations"),
         (samples.curve(), "Still recognised: 3 of 4 at epsilon 0.01."),
         (samples.region(), "The model is wrong in 200 of 200 fresh samples of this box"),
         (samples.sweep(), "The model is right in 6 of 8 configurations"),
     ],
-    ids=["gap", "curve", "region", "sweep"],
+    ids=["curve", "region", "sweep"],
 )
 def test_show_prints_what_the_command_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], summary: Any, first: str

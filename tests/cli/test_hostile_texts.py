@@ -18,7 +18,7 @@ from advsearch.errors import FileFormatError
 from advsearch.models import read_labels
 from advsearch.progress import escaped
 from advsearch.settings import parse_assignment, read_yaml
-from advsearch.yaml_text import parse_yaml
+from advsearch.trust.yaml_text import parse_yaml
 
 ESCAPES = "\x1b]0;title\x07\x9b31m\x7f\u202e\r"
 

@@ -21,16 +21,16 @@ import advsearch
 from advsearch import testing
 from advsearch.cli.dashboard import _LoadedLater as TakenLater
 from advsearch.cli.main import list_commands, main
-from advsearch.cluster import Work
-from advsearch.cluster.worker import Failure, Files, prepare, version
+from advsearch.cluster import WorkerTask
+from advsearch.cluster.worker import run_batch
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import parts_in
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import attacks_of
 from advsearch.questions.photographs.carry_out import Photographs
-from advsearch.registry import allow_named, allowed_code, nothing_allowed
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER
+from advsearch.trust.code import allow_named, allowed_code, nothing_allowed
 
 PLANTED = "open('imported', 'w').close()\nraise RuntimeError('planted')"
 NAME = "planted:make"
@@ -120,7 +120,7 @@ READING = {
 """And those that look at them."""
 
 ALONE = (
-    *("attack", "gap", "harden", "render", "list", "labels", "check", "precision", "stability", "doctor"),
+    *("attack", "harden", "render", "list", "labels", "check", "precision", "stability", "doctor"),
     *("import", "import-3db", "completion"),
 )
 """Those that are told everything, and the dashboard, which is tried below."""
@@ -173,10 +173,10 @@ def test_what_is_typed_behind_a_file_is_imported(typed: str) -> None:
 
 def in_a_worker() -> None:
     settings = AttackConfig(object="mug", model=NAME, controls={"pose": {}}).plain()
-    work = Work("advsearch.questions.attack.carry_out:attack_worker", settings)
-    failure = prepare("somebody's", work, Files({}, {}), version())
-    assert isinstance(failure, Failure)
-    raise InputError(failure.text)
+    work = WorkerTask("advsearch.questions.attack.carry_out:attack_worker", settings)
+    reply = run_batch(work, [], 60.0)
+    assert reply.failure is not None
+    raise InputError(reply.error)
 
 
 def explained() -> None:
@@ -247,8 +247,8 @@ def test_what_is_no_name_of_code_is_refused(name: str) -> None:
 def test_processes_that_we_start_look_for_no_modules_in_the_current_folder(module: str) -> None:
     import io
 
-    from advsearch.models.guards import try_torchscript
     from advsearch.scene.mitsuba_backend.llvm import asked_version
+    from advsearch.trust.foreign_code import try_torchscript
 
     Path(f"{module}.py").write_text("open('imported', 'w').close()")
     asked_version("libnone.so")

@@ -10,7 +10,6 @@ import yaml
 from stored_sweeps import make_sweep
 
 import advsearch
-from advsearch import registry
 from advsearch.cli.flags import IN_A_FILE as COMMANDS
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS
@@ -21,8 +20,10 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep import carry_out as sweeping
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import RunDirectory
-from advsearch.settings import HEADER, power, settings
+from advsearch.settings import HEADER, settings
 from advsearch.threads import cores
+from advsearch.trust import powers
+from advsearch.trust.code import allow_code
 
 MANY = 100_000
 POWERS: dict[str, Any] = {
@@ -49,7 +50,7 @@ CASES = [
     (command, one.name)
     for command in COMMANDS
     for one in settings(CONFIGS[command])
-    if one.power is not power.none
+    if one.power is not powers.none
 ]  # fmt: skip
 """Every such setting of every command that a file may name."""
 
@@ -66,7 +67,7 @@ def written(command: str, **given: Any) -> Path:
         one.name: NEEDED.get(one.name, "mug") for one in settings(CONFIGS[command]) if one.required and not one.default
     }
     needed |= {"object": "mug", "compared": "reference,a.pt2"} if command == "compare" else {}
-    Path("a.yaml").write_text(HEADER + yaml.safe_dump({"schema": 1, "command": command, **needed, **given}))
+    Path("a.yaml").write_text(HEADER + yaml.safe_dump({"schema": 2, "command": command, **needed, **given}))
     return Path("a.yaml")
 
 
@@ -80,7 +81,7 @@ def test_every_setting_that_reaches_beyond_the_run_says_so() -> None:
             inside = {"aov", "suite", "attack", "keep_pictures", "compared", "sweeps", "ask"}
             inside |= {"model", "models"}  # what only a file names is asked nothing (test_addresses.py)
             if any(word in text for word in suspicious) and one.name not in inside:
-                assert one.power is not power.none, f"{command}: {text}"
+                assert one.power is not powers.none, f"{command}: {text}"
 
 
 @pytest.mark.parametrize(("command", "name"), CASES)
@@ -188,7 +189,7 @@ def test_a_part_has_the_workers_of_who_asks(monkeypatch: pytest.MonkeyPatch) -> 
     text = (path / "run.yaml").read_text()
     (path / "run.yaml").write_text(text.replace("workers: null", "workers: 1").replace("log: null", "log: wandb"))
     seen: list[Any] = []
-    monkeypatch.setattr(studies, "carry_out", lambda config, **_: seen.append(config))
+    monkeypatch.setattr(studies, "run_experiment", lambda config, **_: seen.append(config))
     for workers in (3, None):
         asked = SweepConfig(object="mug", grid={"pose.yaw": [0.0]}, workers=workers)
         studies.carry_out_part(path, asked, NullProgress())
@@ -199,4 +200,4 @@ def test_python_gives_power_by_keyword() -> None:
     config = AttackConfig(object="mug", workers=MANY, cluster="tcp://127.0.0.1:1", log="wandb")
     assert (config.workers, config.cluster, config.log) == (MANY, "tcp://127.0.0.1:1", "wandb")
     assert [one.name for one in config.powers] == ["log", "workers", "cluster"]
-    assert advsearch.allow_code is registry.allow_code
+    assert advsearch.allow_code is allow_code

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +15,23 @@ from test_sweep_workers import Disorder, rows, summary
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.attacks import clopper_pearson
-from advsearch.attacks.trials import share_interval
 from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.journal import worker_call
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
+from advsearch.questions.explain.renders import AskedSweep, read_predictions
 from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.carry_out import job_of
 from advsearch.questions.sweep.display import claims, rate_text
-from advsearch.questions.sweep.drives import longest, over_drives
+from advsearch.questions.sweep.drives import Drives, longest, over_drives, planned_distances
 from advsearch.questions.sweep.job import OpenScenes
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import DriveRates
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.tables import read_sweep
+from advsearch.statistics.clustered import share_interval
+from advsearch.statistics.intervals import clopper_pearson
 
 SMALL: dict[str, Any] = {"resolution": 16, "spp": 1, "trials": 0, "batch": 4}
 
@@ -134,7 +136,7 @@ def test_the_worst_of_several_drives_is_the_one_that_is_kept(tmp_path: Path, mon
     times = [row for row in result.summary.axes if row.axis == "path.time"]
     assert times[0].interval == clopper_pearson(times[0].correct, 4), "at one time each drive has one frame"
     (yaw, *_) = [row for row in result.summary.axes if row.axis == "pose.yaw"]
-    assert yaw.interval is not None and yaw.interval[1] - yaw.interval[0] > 0.95, "one drive of five frames"
+    assert yaw.interval is None and yaw.accuracy == 1.0, "one drive of five frames"
     assert "4 drives can show little" in " ".join(result.summary.warnings)
     assert len(set(read_sweep(path)["unit"])) == 4
     (claim, *_) = claims(result.summary)
@@ -228,6 +230,97 @@ def test_intervals_over_drives_cover_the_mean_of_few_drives(drives: int, kind: s
     }[kind]
     got = [over_drives(one, worst=min).interval for one in values]
     assert sum(one is not None and one[0] <= truth <= one[1] for one in got) >= 112  # under 95 % by chance: 1 in 40
+
+
+def test_the_mean_distance_at_first_sight_takes_its_range_from_the_plan_or_has_no_interval(tmp_path: Path) -> None:
+    """Nine drives of ten go along a near path; the far one may not be among those that were drawn."""
+    far = tmp_path / "far.csv"
+    far.write_text("time,x,y,z\n0,60,0,0\n4,30,0,0\n")
+    config = SweepConfig(
+        object="mug", size=1.0, controls={"path": {"reach": 4.0}}, path=f"approach,{far}", samples=2, fps=1.0,
+        set_={"camera.elevation": 0.0, "camera.distance": 1.0}, resolution=16, spp=1, trials=0,
+    )  # fmt: skip
+    job = job_of(config)
+    (axis,) = (one for one in job.axes if one.is_time)
+    ends = planned_distances(job, axis)
+    assert ends == pytest.approx((1.0, 60.0), abs=1e-3)
+    rng, covered, runs = np.random.default_rng(0), 0, 200
+    for _ in range(runs):
+        first = rng.choice([4.0, 60.0], 5, p=[0.9, 0.1])
+        interval = over_drives(first, min, ends).interval
+        assert interval is not None
+        covered += interval[0] <= 9.6 <= interval[1]
+    assert covered >= 0.94 * runs
+    assert over_drives(np.array([4.0, 5.0, 6.0]), min, None).interval is None, "of no known range there is none"
+    assert Drives._distances is None, "never from the sample"
+
+
+REPEATED: dict[str, Any] = {**DRIVE, "samples": 6}
+
+
+def test_repeats_of_one_drive_that_differ_in_noise_are_one_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(swept_scene, "make_renderer", Timed)
+    paths = [tmp_path / name for name in ("first", "second")]
+    for path, frames in zip(paths, ("11100", "11000"), strict=True):
+        (said,), result = clocked(frames, **REPEATED, run=path)
+    assert (said.drives, said.repeats) == (1, 6)
+    assert said.right.mean == pytest.approx(0.4) and said.right.interval is None
+    assert said.first_seen is not None and said.first_seen.interval is None and said.longest_gap.interval is None
+    swept = result.summary
+    assert (swept.units, swept.accuracy, swept.interval) == (1, pytest.approx(0.4), None)
+    assert "all 6 repeats are of one drive and differ in noise alone" in " ".join(swept.warnings)
+    assert "1 drive of 5 frames in 4 s, 6 times each with other noise" in text_of(swept)
+    assert set(read_sweep(paths[0])["unit"]) == {0}
+    compared = advsearch.compare(f"{paths[0]},{paths[1]}", pictures=0, run=tmp_path / "compared")
+    (pair,) = compared.pairs
+    assert (pair.units, pair.unit, pair.p) == (1, "drive", 1.0) and pair.interval[0] < -0.5 and pair.interval[1] > 0.5
+    assert "nothing is shown of others" in " ".join(compared.warnings)
+
+
+def test_repeats_of_points_of_a_grid_that_differ_in_noise_are_as_many_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(swept_scene, "make_renderer", Timed)
+    (said,), result = clocked("11111" + "00011" + "10111" + "11110", **REPEATED, grid={"pose.yaw": "0:360:4"})
+    assert (said.drives, said.repeats, result.summary.units) == (4, 6, 4)
+    assert said.right.mean == pytest.approx(0.75) and said.right.interval == pytest.approx(
+        share_interval([5, 2, 4, 4], [5] * 4)
+    )
+    assert result.summary.interval == pytest.approx(said.right.interval)
+    assert "Intervals are over 4 drives" in " ".join(result.summary.warnings)
+
+
+def swept_parts(folder: Path, *settings: dict[str, Any]) -> list[AskedSweep]:
+    """Sweep with each of some settings, as what `explain` reads."""
+    paths = [folder / f"part-{number}" for number in range(len(settings))]
+    for path, given in zip(paths, settings, strict=True):
+        advsearch.sweep("mug", **SMALL, **given, run=path)
+    return [AskedSweep.of(path) for path in paths]
+
+
+def test_pictures_of_a_longer_sweep_of_the_same_seed_are_not_counted_twice(tmp_path: Path) -> None:
+    """Draws of one seed are the same ones, also where a setting makes other pictures of them."""
+    drawn: dict[str, Any] = {"controls": {"sensor": {"shot": [0.0, 0.15]}}}
+    short, long, other = swept_parts(
+        tmp_path, *({**drawn, "samples": samples, "seed": seed} for samples, seed in ((6, 3), (9, 3), (6, 4)))
+    )
+    alone, both = read_predictions([long]), read_predictions([short, long])
+    assert len(alone) == len(both) == both["unit"].nunique() == 9
+    assert read_predictions([long, other])["unit"].nunique() == 15
+    changed = replace(short, config=short.config.model_copy(update={"label": "cup"}))
+    mixed = read_predictions([changed, long])
+    assert (len(mixed), mixed["unit"].nunique()) == (15, 9), "other settings: other predictions of the same draws"
+
+
+def test_samples_without_draws_and_grids_that_overlap_are_units_by_their_values(tmp_path: Path) -> None:
+    grids = ({"pose.yaw": [0, 90, 180]}, {"pose.yaw": [90, 180, 270, 45]})
+    moving: dict[str, Any] = {**DRIVE, "fps": 0.5, "samples": 4}
+    parts = swept_parts(tmp_path, *({**moving, "grid": grid, "seed": seed} for seed, grid in enumerate(grids)))
+    rows = read_predictions(parts)
+    assert len(rows) == 3 * 28 and rows["unit"].nunique() == 5
+    assert rows.groupby("pose.yaw")["unit"].nunique().tolist() == [1] * 5
 
 
 def test_the_longest_run() -> None:

@@ -203,12 +203,13 @@ def test_a_sitting_may_be_longer_than_the_one_before(tmp_path: Path, config: Con
         RunDirectory.resume(tmp_path / "search", configuration(seconds=9.0))
 
 
-def test_a_run_that_is_older_than_the_note_goes_on_and_a_damaged_note_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("note", "got"), [(None, "none"), ("[1,", "a damaged note"), ("[1]", "a damaged note")])
+def test_a_run_without_its_settings_does_not_go_on(tmp_path: Path, note: str | None, got: str) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
         run.record(Row(kind="search", step=0))
-    with RunDirectory.resume(tmp_path / "run", configuration()) as run:
-        run.store.set_note("settings", "[1,")
-    with pytest.raises(FileFormatError, match="expected the settings the run began with, got a damaged note"):
+        if note is not None:
+            run.store.set_note("settings", note)
+    with pytest.raises(FileFormatError, match=f"expected the settings the run began with, got {got}"):
         RunDirectory.resume(tmp_path / "run", configuration())
 
 

@@ -15,11 +15,10 @@ from advsearch.controls import CONTROLS, make_control
 from advsearch.controls.patch import PatchControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, given_to
+from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, given_to, settings_alone
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.gap import GapConfig, gap
 from advsearch.questions.sweep.carry_out import job_of
 from advsearch.questions.sweep.settings import SweepConfig
 
@@ -112,18 +111,15 @@ def test_a_sweep_and_a_render_give_every_texture_its_resolution(asked: Any, monk
         rendering.render_picture_file(config)
 
 
-def test_a_gap_gives_each_control_what_it_takes(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+def test_a_control_alone_gets_what_it_takes() -> None:
+    config = AttackConfig(object="mug", controls="texture,pose,geometry", **ALL)
     seen: list[Any] = []
-
-    monkeypatch.setattr("advsearch.questions.attack.studies.StudyRun.attack", lambda self, one: _seen(one.config, seen))
-    config = GapConfig(object="mug", controls="texture,pose,geometry", run=str(tmp_path / "gap"), **ALL)
-    gap.run(config)
+    for control, settings_of_control in config.controls.items():
+        changes = settings_alone(config, control, settings_of_control)
+        alone = AttackConfig.of(config, controls={control: settings_of_control}, **changes)
+        check_run_settings(alone)
+        seen.append((alone.epsilon, alone.norm, alone.texture_resolution))
     assert seen == [(0.07, "l2", 16), (None, None, None), (0.07, None, None)]
-
-
-def _seen(config: AttackConfig, seen: list[Any]) -> None:
-    check_run_settings(config)
-    seen.append((config.epsilon, config.norm, config.texture_resolution))
 
 
 # ---- what nobody takes ----------------------------------------------------------------------------------------------

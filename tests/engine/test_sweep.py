@@ -30,7 +30,6 @@ from samples import sweep as swept
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.attacks import clopper_pearson
 from advsearch.attacks.domain import NET, Draws, Product, Seeds, batches
 from advsearch.cli.flags import READERS, help_text, with_flags
 from advsearch.cli.main import ExperimentCommand, main
@@ -57,6 +56,7 @@ from advsearch.runs.tables import read_sweep
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients import GradientPlan
 from advsearch.settings import settings
+from advsearch.statistics.intervals import clopper_pearson
 
 SIZE = 16
 LABELS = ("mug", "vase")

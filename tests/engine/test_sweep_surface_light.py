@@ -13,7 +13,7 @@ from stand_ins import rows
 
 import advsearch
 from advsearch.attacks.domain import Product
-from advsearch.cluster import Done, Workforce
+from advsearch.cluster import BatchResult, WorkerStats
 from advsearch.engine import problem as problems
 from advsearch.engine.acceptance import Deviation
 from advsearch.engine.journal import worker_call
@@ -103,16 +103,16 @@ def test_environments_have_one_arrangement(coarse: list[SurfaceRenderer]) -> Non
 class Two:
     """Two workers, which carry out batches in any order, each with scenes of its own."""
 
-    facts = Workforce(most=2)
+    facts = WorkerStats(most=2)
 
     def __init__(self, job: Any) -> None:
         self.scenes = [OpenScenes(job), OpenScenes(job)]
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         pieces = list(batches)
         random.Random(1).shuffle(pieces)
         for number, items in enumerate(pieces):
-            yield Done(items, worker_call(self.scenes[number % 2].named)(items), f"worker {number % 2}")
+            yield BatchResult(items, worker_call(self.scenes[number % 2].named)(items), f"worker {number % 2}")
 
 
 def test_a_sweep_that_was_stopped_and_goes_on_by_workers_has_the_same_rows(

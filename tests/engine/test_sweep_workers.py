@@ -15,7 +15,7 @@ from test_sweep import FakeRenderer
 import advsearch
 from advsearch.cli.main import main
 from advsearch.cli.output import shown_text as text_of
-from advsearch.cluster import Call, Done, Workforce
+from advsearch.cluster import BatchResult, Call, WorkerStats
 from advsearch.engine.journal import worker_call
 from advsearch.engine.record import LOST
 from advsearch.errors import InputError
@@ -49,9 +49,11 @@ class Disorder:
     seed: int = 0
     lose: int | None = None
     stop: int | None = None
-    facts: Workforce | None = field(default_factory=lambda: Workforce(most=2, lost=1, busy=9.0, alive=10.0, retried=3))
+    facts: WorkerStats | None = field(
+        default_factory=lambda: WorkerStats(most=2, lost=1, busy=9.0, alive=10.0, retried=3)
+    )
 
-    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
+    def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
         pieces = list(batches)
         random.Random(self.seed).shuffle(pieces)
         for count, items in enumerate(pieces):
@@ -60,9 +62,9 @@ class Disorder:
             if self.lose in [query.number for _, _, query in items]:
                 for one in items:
                     lost = "no answer: 3 workers died of it" if one[2].number == self.lose else ""
-                    yield Done([one], None if lost else self.call([one]), lost=lost)
+                    yield BatchResult([one], None if lost else self.call([one]), lost=lost)
             else:
-                yield Done(items, self.call(items), f"worker {count % 2}")
+                yield BatchResult(items, self.call(items), f"worker {count % 2}")
 
 
 def rows(path: Path) -> list[Any]:
@@ -114,12 +116,12 @@ def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path:
 
 def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: Path) -> None:
     class Two(Disorder):
-        def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[Done]:
+        def results(self, batches: Iterable[Sequence[Any]]) -> Iterator[BatchResult]:
             for done in super().results(batches):
                 yield replace(done, machine="ab12" if done.items[0][2].number < 4 else None)
 
     job = job_of(CONFIG)
-    facts = Workforce(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
+    facts = WorkerStats(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
     with RunDirectory.create(tmp_path / "run") as run:
         executor = Two(worker_call(OpenScenes(job).named), facts=facts)
         result = Sweep(job, run, NullProgress(), executor).carry_out()
@@ -132,7 +134,7 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
 
 
 def test_what_is_shown_says_where_the_time_went() -> None:
-    facts = Workforce(most=2, lost=1, refused=1, retried=3, batches=9, busy=9.0, loading=6.0, alive=10.0)
+    facts = WorkerStats(most=2, lost=1, refused=1, retried=3, batches=9, busy=9.0, loading=6.0, alive=10.0)
     text = text_of(swept().model_copy(update={"shared": SharedWork.of_facts(facts, {})}))
     assert "2 at most, busy 90 % of 10" in text and "1 lost, 1 refused, 3 given out again" in text
     assert "workers" not in text_of(swept())

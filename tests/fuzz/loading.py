@@ -233,7 +233,7 @@ def load_blend(path: Path) -> None:
         return subprocess.CompletedProcess(command, 0 if made.exists() else 1, said, "")
 
     with (
-        patch("advsearch.scene.importing.files.subprocess.run", stand_in),
+        patch("advsearch.trust.programs.subprocess.run", stand_in),
         patch.dict(os.environ, {blender.PROGRAM: sys.executable}),
         patch.object(tempfile, "tempdir", str(path.parents[1] / "runs")),
     ):

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import yaml
-from samples import attack, gap, keep_object, make_run
+from samples import attack, curve, keep_object, make_run
 from stored_sweeps import make_sweep
 
 from advsearch.options import Value
@@ -41,8 +41,8 @@ COLUMNS = (
 
 def _study(path: Path) -> None:
     with RunDirectory.create_for(AttackConfig(object="mug", run=str(path))) as run:
-        run.write_summary(gap())
-    for name in gap().parts:
+        run.write_summary(curve())
+    for name in curve().parts:
         part = make_run(path / PARTS / name)
         write_page(part, read_result(part))
     write_page(path, read_result(path))

@@ -24,9 +24,10 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import InputError, ModelError
 from advsearch.models import address
-from advsearch.models.address import KEY, AskedModel, checked, is_local
-from advsearch.registry import nothing_allowed
+from advsearch.models.address import AskedModel
 from advsearch.tasks import make_task
+from advsearch.trust.code import nothing_allowed
+from advsearch.trust.network import KEY, check_address, is_local
 
 SECRET = "sk-very-secret"
 SMALL = ["--object", "mug", "--resolution", "24", "--spp", "2", "--verify-spp", "4", "--trials", "6", "--quiet"]
@@ -321,7 +322,7 @@ def test_the_key_is_in_no_message(server: Server, monkeypatch: pytest.MonkeyPatc
 def test_addresses_that_are_refused(spec: str, expected: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(KEY, SECRET)
     with pytest.raises(InputError, match=expected):
-        checked(spec)
+        check_address(spec)
 
 
 def test_this_machine_is_told_by_its_addresses() -> None:

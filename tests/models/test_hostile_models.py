@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from advsearch import load_model
 from advsearch.errors import FileFormatError
-from advsearch.models import archive
-from advsearch.models import exported as reader
+from advsearch.trust import archives
+from advsearch.trust import exported_programs as reader
 
 Program = dict[str, Any]
 
@@ -451,8 +451,8 @@ def test_torchscript_touches_nothing(kind: type[Scripted], tmp_path: Path, capfd
 ANSWER = """
 import sys
 from advsearch.cli.main import main
-from advsearch.models import guards
-guards.LONGEST = 40
+from advsearch.trust import foreign_code
+foreign_code.LONGEST = 40
 sys.exit(main(["labels", "mug", "--model", sys.argv[1]]))
 """
 
@@ -517,7 +517,7 @@ def test_a_part_that_a_pickle_names_many_times_is_looked_at_once() -> None:
     for _ in range(30):
         wide = [wide] * 9  # in all 9**30 parts, if each is counted as often as it stands there
     with zipfile.ZipFile(io.BytesIO(), "w") as empty:
-        archive._check_values(archive.Archive(Path("net.pt"), empty, {}), "constants.pkl", wide)
+        archives._check_values(archives.Archive(Path("net.pt"), empty, {}), "constants.pkl", wide)
 
 
 def test_pickles_of_torchscript_make_nothing(script: Path, tmp_path: Path) -> None:

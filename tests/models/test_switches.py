@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.models import load_model
-from advsearch.models.guards import PLAIN, Switches, plainly
-from advsearch.registry import allow_code
+from advsearch.trust.code import allow_code
+from advsearch.trust.foreign_code import PLAIN, Switches, plainly
 
 TURNED = {
     "type": Switches(dtype=torch.float64),

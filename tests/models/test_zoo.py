@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from advsearch.errors import FileFormatError, ModelError, UnknownNameError
 from advsearch.models import ModelWarning, load_model
 from advsearch.models.zoo.library import reading
-from advsearch.registry import allow_named, nothing_allowed
 from advsearch.tasks import Detection
+from advsearch.trust.code import allow_named, nothing_allowed
 
 IMAGES = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
 
@@ -365,8 +365,8 @@ def test_an_onnxruntime_that_reads_elsewhere_is_refused(
 )
 def test_onnx_without_an_end_ends_with_one_sentence(tmp_path: Path, content: bytes) -> None:
     real_onnxruntime()
-    code = "import sys; from advsearch.cli.main import main; from advsearch.models import guards; "
-    code += "guards.LONGEST = 40; sys.exit(main(['labels', 'mug', '--model', sys.argv[1]]))"
+    code = "import sys; from advsearch.cli.main import main; from advsearch.trust import foreign_code; "
+    code += "foreign_code.LONGEST = 40; sys.exit(main(['labels', 'mug', '--model', sys.argv[1]]))"
     command = [sys.executable, "-c", code, str(onnx_file(tmp_path, content))]
     environment = {**os.environ, "ADVSEARCH_LIMITS": "0.03"}  # 1 second
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)

@@ -15,7 +15,6 @@ from samples import make_run, sweep
 from stored_sweeps import described
 
 import advsearch
-from advsearch.attacks.trials import mcnemar, paired_difference
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError
 from advsearch.options import Value
@@ -28,6 +27,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.runs.summary import read_result
 from advsearch.runs.tables import EDGES
+from advsearch.statistics.paired import mcnemar, paired_difference
 from advsearch.viewer import thumbnails
 
 PICTURES = 400

@@ -13,7 +13,6 @@ from PIL import Image
 from stored_sweeps import make_sweep
 
 import advsearch
-from advsearch.attacks import clopper_pearson
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.explain.result import ExplainResult
@@ -26,6 +25,7 @@ from advsearch.questions.report.evidence import (
 )
 from advsearch.report.wording import interval_text, percent
 from advsearch.runs.store import NAME, Store
+from advsearch.statistics.intervals import clopper_pearson
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

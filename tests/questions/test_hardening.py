@@ -27,6 +27,7 @@ from advsearch.models import load_model, reference
 from advsearch.models.reference import Trainable, trainable
 from advsearch.questions.attack.carry_out import problem_of
 from advsearch.questions.attack.settings import AttackConfig
+from advsearch.questions.harden.carry_out import _share
 from advsearch.questions.harden.lessons import (
     Lesson,
     RenderedLesson,
@@ -51,6 +52,7 @@ from advsearch.questions.harden.scenes import (
 from advsearch.questions.harden.training import ClassifierCourse, Gradients
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.library import load_environment
+from advsearch.statistics.intervals import clopper_pearson
 
 LABELS = [f"class {number}" for number in range(14)]
 
@@ -406,3 +408,14 @@ def test_pictures_are_a_folder_for_each_class_and_a_webdataset(tmp_path: Path) -
         assert len({name.partition(".")[0] for name in names}) == 4
         last = tar.extractfile(names[-1])
         assert last is not None and json.loads(last.read()) == {"class": 1, "kind": "worst"}
+
+
+def test_the_interval_of_plain_pictures_is_over_scenes_whose_views_are_alike() -> None:
+    rng, covered, runs = np.random.default_rng(0), 0, 300
+    for _ in range(runs):
+        share = _share(np.repeat(rng.random(56) < 0.85, 2).tolist(), views=2)
+        assert share is not None and share.count == 112
+        covered += share.interval[0] <= 0.85 <= share.interval[1]
+    assert covered >= 0.94 * runs
+    alone = _share([True] * 9 + [False])
+    assert alone is not None and alone.interval == clopper_pearson(9, 10)

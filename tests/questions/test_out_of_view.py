@@ -11,15 +11,15 @@ import pytest
 import small_models
 
 import advsearch
-from advsearch.attacks import clopper_pearson
 from advsearch.errors import InputError
 from advsearch.questions.report.evidence import conditions_of
 from advsearch.questions.sweep.display import distance_of
 from advsearch.questions.sweep.result import Predictions
-from advsearch.registry import allow_code
 from advsearch.runs.summary import read_result
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement, Prediction
 from advsearch.testing import assert_no_worse, assert_suite
+from advsearch.trust.code import allow_code
 from advsearch.viewer.columns import UNKNOWN, packed, read_columns
 
 pytestmark = pytest.mark.usefixtures("two_threads")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import advsearch
-from advsearch.attacks import clopper_pearson, make_policy
+from advsearch.attacks import make_policy
 from advsearch.cli.main import main
 from advsearch.engine.surface_light import refusal_of_surface_light
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
@@ -32,6 +32,7 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SurfaceMap
 from advsearch.runs.files import write_png
 from advsearch.runs.summary import read_result
+from advsearch.statistics.intervals import clopper_pearson
 
 SCENES = Path(__file__).resolve().parents[2] / "advsearch/bundled/data/environments"
 
@@ -332,7 +333,7 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
         done.append(config.object)
         return real(config, **named)
 
-    monkeypatch.setattr(studies, "carry_out", stopping)
+    monkeypatch.setattr(studies, "run_experiment", stopping)
     with pytest.raises(KeyboardInterrupt):
         advsearch.recipe(path, run=run)
     path.unlink()  # it goes on as it began

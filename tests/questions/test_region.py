@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from stand_ins import Impatient, rows
 
-from advsearch.engine import acceptance, problem
+from advsearch.engine import acceptance
 from advsearch.questions.region import growing, region
 from advsearch.questions.region.result import RegionConfig, RegionResult
 from advsearch.runs.store import NAME as STORE
@@ -53,7 +53,7 @@ def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Pa
     assert result.samples == 8 and checked % 8 == 0 and checked >= 8
     assert predicted and found.count(("map", True, 4)) == 9 and len(found) == predicted + checked + 9
     assert result.renders["products"] == predicted + 9
-    compared = 3 * problem.FIRST
+    compared = 3 * acceptance.FIRST
     assert result.renders["verification"] == growing.AT_CENTRE + checked + compared
 
 

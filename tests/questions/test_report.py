@@ -62,8 +62,6 @@ def everything() -> Iterator[tuple[str, dict[str, Any] | None, Result]]:
         for goal in ({}, samples.TARGET, samples.EASIER):
             yield ending, rate, samples.attack(ending=ending, verified=rate, **own, **goal)
     for ending, rate in product(ENDINGS, RATES):
-        row = {**samples.GAP["table"][0], "ending": ending, "worst": rate}
-        yield ending, rate, samples.gap(table=[row])
         cell = {**samples.REPLAY["table"][0], "ending": ending, "verified": rate}
         yield ending, rate, ReplayResult.of({**samples.REPLAY, "table": [cell]})
         if rate is not None:
@@ -112,7 +110,7 @@ def test_no_ending_makes_a_claim_that_the_trials_do_not_carry() -> None:
 def test_what_was_stopped_claims_nothing_whatever_it_has_counted(ending: str) -> None:
     stopped = [
         samples.attack(ending=ending), samples.sweep(ending=ending), samples.curve(ending=ending),
-        samples.gap(ending=ending), samples.region(ending=ending), samples.matrix(ending=ending),
+        samples.region(ending=ending), samples.matrix(ending=ending),
         HardenResult.of({**samples.HARDEN, "ending": ending}), ExplainResult.of({**samples.EXPLAIN, "ending": ending}),
         ReplayResult.of({**samples.REPLAY, "ending": ending}),
     ]  # fmt: skip
@@ -239,8 +237,8 @@ def test_a_run_notes_what_is_bundled_and_used_and_nothing_else() -> None:
 
 
 def test_settings_are_listed_as_far_as_they_were_used() -> None:
-    listed = RecordedSettings("", {**AttackConfig(object="car", camera="dashcam", set={"ground.kind": "table"}).plain(),
-                                   "command": "attack"}).as_text()  # fmt: skip
+    config = AttackConfig(object="car", camera="dashcam", set_={"ground.kind": "table"})
+    listed = RecordedSettings("", {**config.plain(), "command": "attack"}).as_text()
     assert (listed["camera"], listed["set"]) == ("dashcam", '{"ground.kind": "table"}') and listed["seed"] == "0"
     assert not {"environment", "run", "overwrite", "minimise", "over", "target"} & listed.keys()
     swept = {**SweepConfig(object="mug").plain(), "command": "sweep"}

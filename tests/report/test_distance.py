@@ -11,11 +11,12 @@ import pytest
 from samples import sweep
 from stored_sweeps import make_sweep
 
-from advsearch.attacks.trials import clopper_pearson
 from advsearch.errors import InputError
-from advsearch.questions.sweep.display import distance_of, distance_sentence, find_dips, seen_from
+from advsearch.questions.sweep.display import distance_of, distance_sentence, seen_from
 from advsearch.questions.sweep.page import SweepSource, sweep_page_html
 from advsearch.questions.sweep.summary import AxisRow
+from advsearch.statistics.intervals import clopper_pearson
+from advsearch.statistics.monotone import find_dips
 
 DISTANCES = (5.0, 10.0, 20.0, 40.0, 80.0)
 

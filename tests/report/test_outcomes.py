@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
 import pytest
 from samples import EXPLAIN, HARDEN, SHARE, attack, rated, sweep
 
-from advsearch.attacks.trials import clopper_pearson
 from advsearch.options import OUT_OF_VIEW, Outcome
+from advsearch.questions.attack.outcome import name_objective
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.wording import attack_verdict, remarks
 from advsearch.questions.explain.result import ExplainResult
@@ -20,9 +20,13 @@ from advsearch.questions.sweep.page import sweep_verdict
 from advsearch.questions.sweep.result import OUTCOMES, Predictions, SweptAxis
 from advsearch.questions.test.result import FAILED, search_verdict, share_reason, tried_reason
 from advsearch.report.shown import shown
+from advsearch.report.wording import wanted
 from advsearch.runs.store import Row
 from advsearch.runs.tables import count_wrong_outcomes, sweep_frame
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement, Prediction
+from advsearch.tasks.depth import Depth
+from advsearch.tasks.detection import Detection
 
 COUNTS = {"missed": 2, "loose": 3}
 SAID = "2 missed, 3 in a loose box"
@@ -34,6 +38,15 @@ def judged(right: bool, label: str, outcome: Outcome | None) -> Judgement:
     return Judgement(-margin, margin, right, Prediction(label), payload)
 
 
+def test_a_goal_in_the_task_is_named_as_one_in_the_objective_is() -> None:
+    """`detection={seek: create}` looks for what the objective `create` looks for, and not for a miss."""
+    created = name_objective(Detection(seek="create"), "score")
+    assert created == "create" == name_objective(Detection(), "create")
+    assert wanted(created, "this mug") == "makes the model see beside this mug what is not there"
+    assert name_objective(Detection(), None) == "score" == name_objective(Depth(), "score")
+    assert name_objective(Depth(seek="nearer"), None) == "nearer"
+
+
 def test_an_attack_says_that_a_loose_box_is_no_miss() -> None:
     loose = attack(
         object="person",
@@ -43,14 +56,15 @@ def test_an_attack_says_that_a_loose_box_is_no_miss() -> None:
     said = attack_verdict(loose)
     assert said.startswith("The model sees this person, but in a loose box in 20 of 20 fresh renders")
     assert "where there is none" not in said
-    both = {"labels": {"person in a loose box": 15, "no person": 5}, "outcomes": {"missed": 5, "loose": 15}}
-    said = attack_verdict(attack(object="person", task="detection", verified=rated(**both)))
+    labels = {"person in a loose box": 15, "no person": 5}
+    verified = rated(labels=labels, outcomes={"missed": 5, "loose": 15})
+    said = attack_verdict(attack(object="person", task="detection", verified=verified))
     assert said.startswith("The model is wrong about this person (5 missed, 15 in a loose box) in 20 of 20 fresh")
 
 
 def test_a_clean_scene_that_fails_says_how() -> None:
     control = {"correct": 3, "trials": 8, "rate": 0.375, "interval": [0.1, 0.8], "outcomes": COUNTS}
-    summary = attack(task="detection", clean={**attack().to_dict()["clean"], "control": control})
+    summary = attack(task="detection", clean={**cast(Any, attack().to_dict()["clean"]), "control": control})
     assert f"The clean scene itself fails 5 of its 8 trials ({SAID})." in remarks(summary)
 
 
@@ -95,7 +109,8 @@ def test_claims_say_how_a_detector_fails() -> None:
     found = attack(task="detection", ending="found", verified=rated(labels={"no cup": 20}, outcomes={"missed": 20}))
     verdict, reason = search_verdict(found, AttackConfig(object="mug"))
     assert verdict == FAILED and reason.endswith(": 20 missed") and "a no cup" not in reason
-    _, reason = tried_reason(0, 8, "no cup", clopper_pearson(0, 8), "8 missed")
+    interval = clopper_pearson(0, 8)
+    reason = tried_reason(FAILED, (0, 8, 0), "no cup", interval, over=False, outcomes="8 missed")
     assert reason.endswith(": 8 missed")
     assert SAID in share_reason("right", FAILED, 7, 12, (0.2, 0.8), "most wrong where it says no cup", SAID)
 

@@ -187,7 +187,7 @@ def test_a_run_whose_disk_was_full_at_the_end_goes_on_and_has_everything(
 
     result = attack(verified=None)
     with monkeypatch.context() as patched:
-        patched.setattr("advsearch.runs.files.os.replace", full)
+        patched.setattr("advsearch.trust.writing.os.replace", full)
         with RunDirectory.resume("one") as again, pytest.raises(StorageError, match="the disk is full"):
             keep_result(again, result)
     assert not finished(run) and not (run / full_at).exists() and not list(run.glob(".part-*"))

@@ -14,18 +14,19 @@ from typing import Any
 
 import pytest
 from covering import once_each
-from samples import GAP, REGION, SWEEP, attack, rated
+from samples import CURVE, REGION, SWEEP, attack, rated
 
 from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.options import Value
 from advsearch.runs import summary
 from advsearch.runs.directory import RunDirectory, find_run
-from advsearch.runs.files import read_png, write_text
+from advsearch.runs.files import read_png
 from advsearch.runs.listing import listed_run
 from advsearch.runs.results import Result
 from advsearch.runs.store import Row, Store, Told
 from advsearch.settings import HEADER
+from advsearch.trust.writing import write_text
 from advsearch.viewer import thumbnails
 
 SUMMARY = attack(ending="interrupted", verified=rated(3)).to_dict()
@@ -165,7 +166,7 @@ def test_summaries_that_are_none_are_named(text: str, run: Path, capsys: pytest.
 OTHERS = [None, 3, "text", [], [1], {}, {"a": [1]}, True, float("inf"), {"a\u001b[2J": "\u001b"}]
 
 
-@once_each("summary, value", [SUMMARY, SWEEP, GAP, REGION], OTHERS)
+@once_each("summary, value", [SUMMARY, SWEEP, CURVE, REGION], OTHERS)
 def test_summaries_of_other_types_are_named(
     summary: dict[str, Any], value: Any, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

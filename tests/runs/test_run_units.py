@@ -38,6 +38,23 @@ def test_without_frames_a_unit_is_a_picture() -> None:
     assert Units((3,), None, 1, models=2).of(np.arange(6)).tolist() == [0, 0, 1, 1, 2, 2]
 
 
+@pytest.mark.parametrize("frames", [None, 1])
+def test_pictures_that_differ_in_noise_alone_are_one_unit(frames: int | None) -> None:
+    units = Units((3, 5), frames, models=2, noise=4)
+    count = 3 if frames == 1 else 15
+    steps = np.arange(2 * 15 * 4)
+    assert (np.unique(units.of(steps), return_counts=True)[1] == units.size).all()
+    assert len(np.unique(units.of(steps))) == count
+    assert units.name == ("configuration" if frames is None else "drive")
+
+
+def test_older_notes_do_not_say_that_samples_are_noise_and_the_sampler_does(tmp_path: Path) -> None:
+    with Store(tmp_path / STORE) as store:
+        store.set_note(NOTE, '{"sizes": [3, 5], "frames": 1, "samples": 4, "models": 2, "again": 0}')
+        assert units_of(store) == Units((3, 5), 1, 4, 2)
+        assert units_of(store, is_drawn=False) == Units((3, 5), 1, 1, 2, noise=4)
+
+
 def test_a_run_notes_its_units_and_what_is_none_is_refused(tmp_path: Path) -> None:
     with Store(tmp_path / STORE) as store:
         assert units_of(store) is None

@@ -29,17 +29,18 @@ from hypothesis import strategies as st
 from samples import attack, exr, rated, sweep
 
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
-from advsearch.files import open_regular
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs import directory, files, summary
 from advsearch.runs.directory import RunDirectory, default_name, find_run, run_path
 from advsearch.runs.export import FORMATS, write_rows
-from advsearch.runs.files import PART, VERSION, RunLock, replacing, write_bytes, write_text
+from advsearch.runs.files import VERSION
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.results import Result, plain
 from advsearch.runs.store import Row, Store
 from advsearch.runs.summary import read_result
+from advsearch.trust.stored_files import open_regular
+from advsearch.trust.writing import PART, RunLock, replacing, write_bytes, write_text
 
 WRITER = """
 import sys
@@ -185,7 +186,7 @@ def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> Non
             db.execute(f"PRAGMA user_version = {version}")
             db.execute("UPDATE meta SET value = '2026-11-24T10:00:00Z'")
         db.close()
-        said = rf"expected version 9 of the results, got {version}; read it with .* that wrote it, that of 2026-11-24"
+        said = rf"expected version 10 of the results, got {version}; read it with .* that wrote it, that of 2026-11-24"
         for read_only in (True, False):
             with pytest.raises(FileFormatError, match=said):
                 Store(path, read_only=read_only)
@@ -216,7 +217,9 @@ def test_any_values_come_back(codec: Store, values: dict[str, Any], objective: f
 
 
 def test_a_second_process_is_refused(run: RunDirectory) -> None:
-    code = "import sys; from pathlib import Path; from advsearch.runs.files import RunLock; RunLock(Path(sys.argv[1]))"
+    code = (
+        "import sys; from pathlib import Path; from advsearch.trust.writing import RunLock; RunLock(Path(sys.argv[1]))"
+    )
     second = subprocess.run([sys.executable, "-c", code, run.path], capture_output=True, text=True)
     assert f"process {os.getpid()} is working on this run; wait for it or choose another name" in second.stderr
     assert second.returncode != 0

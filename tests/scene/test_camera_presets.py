@@ -53,7 +53,7 @@ def test_a_dashcam_is_in_the_lane_behind_a_car_and_before_a_sign(name: str) -> N
 
 
 def test_what_is_given_wins_over_a_preset() -> None:
-    given = {"camera.distance": 30.0, "camera.fov": 60.0, "camera.height": 1.1, "camera.azimuth": 0.0}
+    given = {"camera.distance": 30.0, "camera.fov": 60.0, "camera.height": 1.1, "camera.azimuth": 180.0}
     scene = seen("car", "dashcam", settings=given)
     x, _, z = lens(scene)
     assert (x > 0.0, z, scene.number("camera.fov")) == (True, pytest.approx(1.1, abs=1e-4), 60.0)

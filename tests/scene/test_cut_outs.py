@@ -24,7 +24,7 @@ from advsearch.scene.mitsuba_backend.writing import write_scene
 pytestmark = pytest.mark.usefixtures("two_threads")
 
 SIZE = 16
-SEEN = {"camera.azimuth": 90.0, "camera.elevation": 0.0, "ground.size": 0.0}
+SEEN = {"camera.azimuth": 180.0, "camera.elevation": 0.0, "ground.size": 0.0}
 
 
 def card(alpha: np.ndarray, mode: str = "MASK", shift: float = 0.0, factor: float = 1.0) -> trimesh.Trimesh:
@@ -103,7 +103,7 @@ def test_cut_outs_of_one_part_of_two_are_baked(tmp_path: Path) -> None:
     assert asset.opacity is not None and asset.opacity.shape == asset.base_color.shape[:2]
     mesh = asset.mesh
     for left, share in ((True, 0.75), (False, 1.0)):
-        corners = mesh.uvs[(mesh.vertices[:, 0] < 0.0) == left]
+        corners = mesh.uvs[(mesh.vertices[:, 1] < 0.0) == left]
         rows = slice(int((1.0 - corners[:, 1].max()) * 512), int((1.0 - corners[:, 1].min()) * 512))
         columns = slice(int(corners[:, 0].min() * 512), int(corners[:, 0].max() * 512))
         assert asset.opacity[rows, columns].mean() == pytest.approx(share, abs=0.04)

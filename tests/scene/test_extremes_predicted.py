@@ -222,7 +222,7 @@ def test_what_stands_behind_glass_is_refused() -> None:
     """An object behind clear glass is refused in words."""
     reason = why_not(small(PAINTED, parts=[glass()]), ["camera"])
     checks = [
-        holds("it says that there is more in the scene", reason is not None and "more in the scene" in reason),
+        holds("it says that there is more in the scene", reason is not None and "more in the scene" in reason.text),
         holds("without the glass it is not refused", why_not(small(PAINTED, denoise="oidn"), ["camera"]) is None),
     ]
     right(Outcome(checks))

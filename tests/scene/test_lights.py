@@ -11,7 +11,7 @@ from stand_ins import Impatient, rows
 from torch import Tensor
 
 import advsearch
-from advsearch.engine import acceptance, problem
+from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.renderer import Renderer
@@ -191,7 +191,7 @@ def test_a_prediction_that_is_off_ends_in_rendering_and_goes_on_so(
 ) -> None:
     """Also in a run that was stopped after that."""
     monkeypatch.setattr(searching, "EVERY", 6)
-    off = problem.Deviation(9.0, 0.0, 2.0, pictures=6)
+    off = acceptance.Deviation(9.0, 0.0, 2.0, pictures=6)
     monkeypatch.setattr(searching, "compared", lambda view: off)
     settings = {**SEARCH, "deterministic": True}
     whole = advsearch.attack("mug", run=tmp_path / "whole", **settings).summary

@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("two_threads")
 SIDE = 128
 RADIUS = 0.3
 """Of the ball of which a cap stands out of the unit square; it is cut where it is 45 degrees steep."""
-SEEN = {"camera.azimuth": -90.0, "camera.elevation": 0.0, "camera.fov": 20.0, "ground.size": 0.0}
+SEEN = {"camera.azimuth": 0.0, "camera.elevation": 0.0, "camera.fov": 20.0, "ground.size": 0.0}
 SIZE = 32
 UNIT = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
 CORNERS = np.array([[-0.5, 0, 0], [0.5, 0, 0], [0.5, 1, 0], [-0.5, 1, 0.0]])
@@ -105,8 +105,8 @@ def written(made: Any, folder: Path) -> Path:
 
 
 def lit(scene: SceneDescription, x: float, z: float) -> MitsubaScene:
-    """The scene with one lamp on a side of the square, which looks along -y."""
-    lamp = PointLamp("lamp", position=(x, -6.0, 0.5 + z), intensity=(40.0, 40.0, 40.0))
+    """The scene with one lamp on a side of the square, which looks along x."""
+    lamp = PointLamp("lamp", position=(6.0, x, 0.5 + z), intensity=(40.0, 40.0, 40.0))
     return MitsubaScene(replace(scene, parts=(lamp,)), (SIZE, SIZE), max_depth=2)
 
 

@@ -50,7 +50,7 @@ def test_a_walker_stays_on_the_ground_and_upright(walk: int) -> None:
     assert shoes[:, 2].min() < 1e-6, "something else than a shoe touches the ground"
 
 
-SOMEBODY = (
+SOMEBODY: tuple[dict[str, float], ...] = (
     {}, {"gender": 0.0}, {"weight": 1.0, "age": 80.0}, {"age": 12.0, "height": 1.3}, {"height": 2.0, "gender": 0.3}
 )  # fmt: skip
 

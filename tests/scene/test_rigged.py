@@ -161,13 +161,13 @@ def expected(seconds: float | None, fat: float | None = None, turn: np.ndarray |
 
 
 def in_mesh(points: np.ndarray) -> np.ndarray:
-    """File to mesh: z up, the rest pose 1 large, on the ground."""
+    """File to mesh: z up, +z of the file ahead, the rest pose 1 large, on the ground."""
     rest = expected(None) @ UP.T
     low, high = rest.min(axis=0), rest.max(axis=0)
     return np.asarray((points @ UP.T - [*(low + high)[:2] / 2, low[2]]) / (high - low).max())
 
 
-UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 def moved(path: Path, clip: str | None = None, /, **values: float) -> np.ndarray:

@@ -83,9 +83,9 @@ def test_a_node_is_the_object_and_the_rest_stays_in_its_place_around_it(file: Pa
     assert np.ptp(scene.base_vertices, axis=0) == pytest.approx([1.0, 1.0, 1.0])
     wall = scene.meshes["the-wall"]
     corners = wall.mesh.vertices @ wall.to_world[:3, :3].T + wall.to_world[:3, 3]
-    # in the file x -5 to 5, height 0 to 6, depth -5.1 to -4.9; the crate of side 2 stands at (1, 0, 0)
-    assert corners.min(axis=0) == pytest.approx([-3.0, 2.45, 0.0], abs=1e-5)
-    assert corners.max(axis=0) == pytest.approx([2.0, 2.55, 3.0], abs=1e-5)
+    # in the file x -5 to 5, height 0 to 6, z -5.1 to -4.9, which is our x; the crate of side 2 stands at (1, 0, 0)
+    assert corners.min(axis=0) == pytest.approx([-2.55, -3.0, 0.0], abs=1e-5)
+    assert corners.max(axis=0) == pytest.approx([-2.45, 2.0, 3.0], abs=1e-5)
     assert scene.number("ground.size") == 0.0
 
 
@@ -94,8 +94,8 @@ def test_a_lamp_lights_as_in_the_file_and_takes_the_place_of_a_map(file: Path) -
     assert scene.environment is None
     lamp = scene.lamps["bulb"]
     assert isinstance(lamp, PointLamp)
-    assert lamp.position == pytest.approx((-0.5, 0.0, 2.5))
-    _, here = lamp.lighting(np.array([-0.5, 0.0, 0.0]))
+    assert lamp.position == pytest.approx((0.0, -0.5, 2.5))
+    _, here = lamp.lighting(np.array([0.0, -0.5, 0.0]))
     candela = np.array([1.0, 0.5, 0.0]) * 683.0
     assert here == pytest.approx(candela / LUMENS / 5.0**2)  # five metres below it
     assert describe(f"{file}#crate", "kitchen").environment_name == "kitchen"
@@ -108,8 +108,8 @@ def test_a_camera_of_the_file_sees_the_object_where_it_is(file: Path) -> None:
     pose = camera_to_world(scene.seen_by("front"))
     seen = np.linalg.inv(pose) @ np.array([0.0, 0.0, 0.5, 1.0])
     assert seen[:3] == pytest.approx([0.0, 0.0, 4.0], abs=1e-6)  # eight metres ahead, in the middle
-    right = np.linalg.inv(pose) @ np.array([0.5, 0.0, 0.5, 1.0])
-    assert right[0] < 0.0  # +x is to the left
+    right = np.linalg.inv(pose) @ np.array([0.0, 0.5, 0.5, 1.0])
+    assert right[0] < 0.0  # x of a camera is to the left
 
 
 def test_an_object_brings_what_hangs_on_it(data: bytes, tmp_path: Path) -> None:
@@ -191,11 +191,11 @@ def test_a_spot_shines_in_its_cone(file: Path, data: bytes) -> None:
     lamp = scene.lamps["bulb"]
     assert isinstance(lamp, SpotLamp)
     assert lamp.direction == pytest.approx((0.0, 0.0, -1.0), abs=1e-9)
-    assert lamp.position == pytest.approx((-0.5, 0.0, 2.5))
+    assert lamp.position == pytest.approx((0.0, -0.5, 2.5))
     candela = np.array([1.0, 0.5, 0.0]) * 683.0
     for angle, share in ((0.0, 1.0), (9.0, 1.0), (20.0, 0.5), (31.0, 0.0)):
         out = 2.5 * math.tan(math.radians(angle))
-        _, here = lamp.lighting(np.array([out - 0.5, 0.0, 0.0]))
+        _, here = lamp.lighting(np.array([0.0, out - 0.5, 0.0]))
         metres = 5.0 / math.cos(math.radians(angle))
         assert here == pytest.approx(share * candela / LUMENS / metres**2 * 4.0 / 2.0**2, abs=1e-9)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -142,6 +143,21 @@ def test_a_camera_inside_a_house_is_said_and_how_often_it_is_there() -> None:
     assert re.search(r"inside a house of the place in [3-6][0-9] % of the views", said)
 
 
+@pytest.mark.parametrize(
+    ("distance", "elevation", "solid"), [(8.0, 5.0, "a wall"), (8.0, 40.0, "the ceiling"), (1.0, 40.0, None)]
+)
+def test_a_camera_outside_a_room_is_said(distance: float, elevation: float, solid: str | None) -> None:
+    given: dict[str, float | str | Sequence[float]] = {
+        "ground.kind": "room",
+        "camera.distance": distance,
+        "camera.elevation": elevation,
+    }
+    scene = describe("mug", "kitchen", given=given)
+    notes = make_space([make_control("pose")], scene).notes(scene)
+    assert bool(notes) == (solid is not None)
+    assert solid is None or f"The camera is inside {solid} of the place" in notes[-1]
+
+
 def test_outlines_overlap_where_squares_do() -> None:
     def overlap(one: np.ndarray, other: np.ndarray, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> bool:
         return overlapping(footprint(one), footprint(other + np.array(shift)))
@@ -255,7 +271,8 @@ def test_a_matrix_of_transport_knows_what_stands_beside() -> None:
 def test_light_on_surfaces_refuses_things_by_its_own_rule() -> None:
     def reason(things: str | None) -> str | None:
         scene = advsearch.load_scene("mug", size=0.1, things=things)
-        return why_not(scene.renderer({"camera": {}}, resolution=16, denoise="oidn"), ["camera"])
+        refusal = why_not(scene.renderer({"camera": {}}, resolution=16, denoise="oidn"), ["camera"])
+        return None if refusal is None else refusal.text
 
     assert reason(None) is None
     assert "more in the scene than the object" in str(reason("bowl@0.2,0.1,size=0.15"))

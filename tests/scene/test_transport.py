@@ -15,7 +15,7 @@ from stand_ins import Impatient, rows
 from torch import Tensor
 
 import advsearch
-from advsearch.engine import acceptance, problem
+from advsearch.engine import acceptance
 from advsearch.engine import transport as searching
 from advsearch.experiment import RunContext, run_and_save
 from advsearch.questions.attack.settings import AttackConfig
@@ -76,7 +76,7 @@ def test_a_fine_pattern_is_compared_without_the_denoiser(renderer: Renderer, pre
     for u in (renderer.start, changed(renderer, 0.1, "signs")):
         halves = renderer.halves(u, 5, 64)[:2]
         with torch.no_grad():
-            squares.append(problem.squares_off(predicted(u), halves, renderer.mask(u)))
+            squares.append(acceptance.squares_off(predicted(u), halves, renderer.mask(u)))
     assert squares[1] < squares[0] + 1.0
 
 

@@ -105,11 +105,14 @@ def part_of(folder: Path, *args: Any, **kwargs: Any) -> tuple[ImportedPart, str]
     return parts[0], notes
 
 
+COLOR_OF_188 = srgb_to_linear(np.array([188, 100, 50], np.float32) / np.float32(255))
+
+
 def linear_color(part: ImportedPart) -> np.ndarray:
     """Return the mean linear colour of a part."""
     surface = part.surface
     if surface.texture is not None:
-        return srgb_to_linear(surface.texture[:, :, :3]).mean(axis=(0, 1))
+        return np.asarray(srgb_to_linear(surface.texture[:, :, :3]).mean(axis=(0, 1)))
     assert surface.color is not None
     return np.asarray(srgb_to_linear(surface.color[:3]))
 
@@ -150,11 +153,11 @@ def test_each_texture_is_looked_up_by_its_own_reader(tmp_path: Path) -> None:
     ("levels", "space", "expected"),
     [
         ([[[188, 100, 50]]], "raw", np.array([188, 100, 50]) / 255),
-        ([[[188, 100, 50]]], "sRGB", srgb_to_linear(np.array([188, 100, 50]) / 255)),
-        ([[[188, 100, 50]]], "auto", srgb_to_linear(np.array([188, 100, 50]) / 255)),
-        ([[[188, 100, 50, 255]]], "auto", srgb_to_linear(np.array([188, 100, 50]) / 255)),
+        ([[[188, 100, 50]]], "sRGB", COLOR_OF_188),
+        ([[[188, 100, 50]]], "auto", COLOR_OF_188),
+        ([[[188, 100, 50, 255]]], "auto", COLOR_OF_188),
         ([[188]], "auto", np.full(3, 188 / 255)),
-        ([[188]], "sRGB", srgb_to_linear(np.full(3, 188 / 255))),
+        ([[188]], "sRGB", srgb_to_linear(np.full(3, 188 / 255, np.float32))),
     ],
 )
 def test_color_spaces(tmp_path: Path, levels: object, space: str, expected: np.ndarray) -> None:
@@ -219,7 +222,7 @@ def test_scale_bias_and_single_channels(tmp_path: Path) -> None:
     save(tmp_path / "a.png", [[[188, 128, 64, 255]]])
     more = "float4 inputs:scale = (0.2, 0.2, 0.2, 1)\nfloat4 inputs:bias = (0.4, 0, 0.1, 0)"
     part, _ = part_of(tmp_path, COLOR, texture("t", "a.png", more))
-    expected = srgb_to_linear(np.array([188, 128, 64]) / 255) * 0.2 + [0.4, 0.0, 0.1]
+    expected = srgb_to_linear(np.array([188, 128, 64], np.float32) / np.float32(255)) * 0.2 + [0.4, 0.0, 0.1]
     assert np.allclose(linear_color(part), expected, atol=0.005)
     numbers = """
         float inputs:roughness.connect = </Root/m/t.outputs:g>
@@ -281,7 +284,7 @@ def test_how_pictures_go_on(tmp_path: Path, wrap: str, expected: tuple[float, ..
 def test_inside_of_its_edges_a_picture_has_no_border(tmp_path: Path) -> None:
     save(tmp_path / "a.png", [[[188, 188, 188]]])
     part, _ = part_of(tmp_path, COLOR, texture("t", "a.png"))
-    assert np.allclose(linear_color(part), srgb_to_linear(np.array(188 / 255)), atol=0.004)
+    assert np.allclose(linear_color(part), srgb_to_linear(np.array(188 / 255, np.float32)), atol=0.004)
 
 
 def test_transforms_in_a_row_and_of_one_texture_only(tmp_path: Path) -> None:
@@ -386,7 +389,8 @@ def test_display_colors_and_opacities_of_faces_and_vertices(tmp_path: Path) -> N
     assert np.allclose(part.colors[blue], [0.0, 0.0, 1.0])
     opacity = 'float[] primvars:displayOpacity = [0.25, 1] (interpolation = "uniform")'
     parts, _ = parts_of(write_stage(tmp_path, mesh=opacity))
-    shares = sorted(1.0 if len(part.surface.color) == 3 else float(part.surface.color[3]) for part in parts)  # type: ignore[arg-type]
+    colors = [part.surface.color for part in parts if part.surface.color is not None]
+    shares = sorted(1.0 if len(color) == 3 else float(color[3]) for color in colors)
     assert shares == pytest.approx([0.25, 1.0], abs=0.003)
 
 
@@ -435,10 +439,10 @@ def test_packages_are_layers_also_in_others(tmp_path: Path) -> None:
         file = folder / "scene.usda"
         file.write_text(referring(name))
         (part,), notes = parts_of(file)
-        assert np.allclose(linear_color(part), srgb_to_linear(np.array([188, 100, 50]) / 255), atol=0.004), name
+        assert np.allclose(linear_color(part), COLOR_OF_188, atol=0.004), name
         assert "missing" not in notes
     (part,), _ = parts_of(folder / "outer.usdz")
-    assert np.allclose(linear_color(part)[0], srgb_to_linear(np.array(188 / 255)), atol=0.004)
+    assert np.allclose(linear_color(part)[0], srgb_to_linear(np.array(188 / 255, np.float32)), atol=0.004)
 
 
 @pytest.mark.parametrize(

@@ -294,9 +294,9 @@ def test_a_sweep_counts(asked: list[str], capsys: pytest.CaptureFixture[str], tm
 @pytest.mark.parametrize(
     ("command", "flags"),
     [
-        ("gap", ["--control", "pose", *SHORT, "--steps", "3", "--average", "4", "--policy", "random"]),
         ("region", ["--control", "pose", "--vary", "pose.yaw", "--denoise", "none", "--samples", "20"]),
         ("attack", ["--over", "camera={azimuth: [35, 45]}", "--draws", "2", "--steps", "2", *SHORT]),
+        ("attack", ["--control", "pose", *SHORT, "--steps", "3", "--average", "4", "--policy", "random"]),
     ],
 )
 def test_other_commands_take_it(

@@ -73,7 +73,7 @@ def test_one_configuration_against_a_detector_and_a_model_of_depth(
     ("command", "flags"),
     [
         ("sweep", ["--grid", "camera.elevation=25,85", "--trials", "6"]),
-        ("gap", ["--control", "pose", "--trials", "6", "--steps", "3", "--average", "4", "--policy", "random"]),
+        ("attack", ["--control", "pose", "--trials", "6", "--steps", "3", "--average", "4", "--policy", "random"]),
     ],
 )
 def test_other_commands_take_both(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from functools import partial
 from html.parser import HTMLParser
@@ -11,33 +10,30 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from samples import (
     ATTACK,
     AVERAGE,
     BRACKET,
     EASIER,
     FORMATION,
-    GAP,
     SUMMARY,
     TARGET,
     attack,
-    gap,
     keep_object,
     make_run,
     rated,
     written_page,
 )
 
-from advsearch.attacks import clopper_pearson
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
 from advsearch.questions.attack import wording
 from advsearch.report.figures import search_axes
-from advsearch.report.shown import NARROW, WIDE, Html, element, join_html, result_figure, shown, study_chart
+from advsearch.report.shown import NARROW, WIDE, Html, element, join_html, study_chart
 from advsearch.report.wording import interval_text, objective_label, percent, seconds_text
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.files import read_png
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.viewer.document import asset
 from advsearch.viewer.pages import LARGE_PICTURE, LARGEST, SMALLER_SIDE, object_part, read_object
 
@@ -294,27 +290,6 @@ def test_the_numbers_at_an_axis_are_whole() -> None:
 def test_any_name_may_stand_in_a_chart(name: str) -> None:
     page = Page(study_chart(partial(search_axes, {name: [0.0, 1.0]}, name), name))
     assert page.text.count(name) >= 3 and not page.all("b")
-
-
-def test_the_worst_case_of_a_gap_does_not_hide_an_average_that_is_equal_to_it() -> None:
-    average = {**AVERAGE, "accuracy": 1.0, "interval": [1.0, 1.0]}
-    row = {**GAP["table"][0], "average": average, "worst": rated(0), "ending": "budget spent"}
-    figure = result_figure(shown(gap(table=[row])))["png"]
-    pixels = np.asarray(Image.open(io.BytesIO(figure)).convert("RGB")).astype(int)
-    pixels = pixels[: int(0.55 * len(pixels))]  # without the axis and the legend
-    for colour in ((0x1D, 0x5F, 0xD0), (0xB3, 0x26, 0x1E)):
-        assert (abs(pixels - colour).max(axis=-1) < 30).sum() > 20
-
-
-def test_every_row_of_a_gap_is_drawn_whole() -> None:
-    row = {**GAP["table"][0], "worst": rated(10), "ending": "budget spent"}
-    several = gap(table=[{**row, "control": name} for name in ("pose", "light", "camera")])
-    figure = result_figure(shown(several))["png"]
-    pixels = np.asarray(Image.open(io.BytesIO(figure)).convert("RGB")).astype(int)
-    red = (pixels[..., 0] - pixels[..., 1:].max(axis=-1) > 20).any(axis=1).astype(int)
-    edges = np.diff(np.concatenate([[0], red, [0]])).nonzero()[0].reshape(-1, 2)
-    heights = edges[:, 1] - edges[:, 0]
-    assert len(heights) == 4 and max(heights) - min(heights) <= 2  # the last one is the legend's
 
 
 # ---- words ----

@@ -18,14 +18,13 @@ import pytest
 from covering import once_each
 from PIL import Image
 from samples import (
+    CURVE,
     EXPLAIN,
-    GAP,
     HARDEN,
     RECIPE,
     REPLAY,
     STABILITY,
     curve,
-    gap,
     keep_object,
     make_run,
     matrix,
@@ -443,11 +442,12 @@ def test_a_browser_without_webgl_has_the_pictures(browser: Browser, attack: Path
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory, attack: Path) -> Path:
-    """A gap, of which the first part is the attack."""
+    """Accuracy over epsilon, of which the first part is the attack."""
     run = tmp_path_factory.mktemp("runs") / "study"
-    rows = [{**GAP["table"][0], "control": name, "run": f"parts/{name}"} for name in ("pose", "camera")]
-    shutil.copytree(attack, run / "parts" / "pose")
-    write_page(run, gap(table=rows, controls=["pose", "camera"], parts=["pose", "camera"]))
+    rows = [{**CURVE["table"][0], "object": name, "run": f"parts/{name}"} for name in ("mug", "bowl")]
+    points = [{**CURVE["curve"][0], "epsilon": epsilon} for epsilon in (0.01, 0.1)]
+    shutil.copytree(attack, run / "parts" / "mug")
+    write_page(run, curve(table=rows, curve=points, parts=["mug", "bowl"]))
     return run
 
 
@@ -456,7 +456,7 @@ def test_a_study_leads_to_its_attacks(browser: Browser, study: Path) -> None:
         assert page.locator("svg.narrow").is_visible() and not page.locator("svg.wide").is_visible()
         page.get_by_role("link", name="mug").first.click()
         page.wait_for_selector(".stage")
-        assert page.url.endswith("/parts/pose/report.html")
+        assert page.url.endswith("/parts/mug/report.html")
 
 
 def faults(page: Page) -> list[str]:
@@ -558,7 +558,7 @@ def test_drawn_parameters_are_shown_in_the_parts_of_the_table(browser: Browser) 
 
 
 def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Path) -> None:
-    from advsearch.attacks import clopper_pearson
+    from advsearch.statistics.intervals import clopper_pearson
 
     code = asset("sweep.js")
     part = code[code.index("  const factorials") : code.index("  function colour")]
@@ -578,7 +578,7 @@ def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Pat
 
 
 def test_intervals_over_drives_are_those_of_the_summary(browser: Browser) -> None:
-    from advsearch.attacks.trials import share_interval
+    from advsearch.statistics.clustered import share_interval
 
     code = asset("sweep.js")
     part, page = code[code.index("  const STAKES") : code.index("  function colour")], browser.new_page()

@@ -23,7 +23,6 @@ from PIL import Image
 from samples import make_run
 from stored_sweeps import make_sweep, serving
 
-from advsearch.attacks import clopper_pearson
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.questions.photographs.carry_out import Photographs, photo_agreement
@@ -36,7 +35,9 @@ from advsearch.questions.photographs.result import (
 )
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
-from advsearch.viewer.clients import LARGEST_SENT, https_context, reachable
+from advsearch.statistics.intervals import clopper_pearson
+from advsearch.trust.network import https_context
+from advsearch.viewer.clients import LARGEST_SENT, reachable
 from advsearch.viewer.server import Dashboard
 
 

@@ -8,7 +8,7 @@ from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import pytest
-from samples import AVERAGE, CURVE, GAP, RECIPE, STABILITY, curve, gap, make_run, matrix, region
+from samples import ACCURACY, AVERAGE, CURVE, RECIPE, STABILITY, curve, make_run, matrix, region
 from stored_sweeps import serving
 
 from advsearch.cli.main import main
@@ -46,12 +46,14 @@ def a_curve() -> Result:
     return curve(curve=points, table=rows, parts=["00-mug", "01-bowl"], objects=["mug", "bowl"])
 
 
-def a_gap() -> Result:
-    """Two controls."""
-    rows = [{**GAP["table"][0], "control": name, "run": f"runs/x/parts/{name}"} for name in ("pose", "camera")]
-    return gap(
-        table=rows, controls=["pose", "camera"], parts=["pose", "camera"], command_line="advsearch gap --object mug"
-    )
+def two_objects() -> Result:
+    """Two objects, with the average of each."""
+    average = {**AVERAGE, **ACCURACY}
+    rows = [
+        {**CURVE["table"][0], "object": name, "run": f"runs/x/parts/{name}", "average": average}
+        for name in ("mug", "bowl")
+    ]
+    return curve(table=rows, parts=["mug", "bowl"], command_line="advsearch attack --object mug,bowl --average 200")
 
 
 def got(address: str) -> str:
@@ -79,14 +81,16 @@ def test_a_curve_is_drawn_with_its_intervals_and_leads_to_its_attacks(tmp_path: 
     assert all((tmp_path / "study" / link).is_file() for link in links)
 
 
-def test_a_gap_has_the_average_beside_the_worst(tmp_path: Path) -> None:
-    page = (make_study(tmp_path / "study", a_gap()) / "report.html").read_text()
+def test_the_average_stands_beside_the_worst_case(tmp_path: Path) -> None:
+    page = (make_study(tmp_path / "study", two_objects()) / "report.html").read_text()
     text = text_of(page)
     right = f"{AVERAGE['correct']}/{AVERAGE['configurations']} (75 %)"
-    assert f"mug camera {right} 35-97 % 20/20 3.25 found" in text
-    assert "right in 75 % of random configurations, yet in 2 of 2 cases one is found" in text
-    assert "advsearch gap --object mug" in text
-    assert 'href="parts/camera/report.html"' in page
+    assert "ending epsilon wrong margin right on average 95 % interval" in text
+    assert f"bowl 20/20 found 0.1 19/20 1.50 {right} 35-97 %" in text
+    assert "advsearch attack --object mug,bowl --average 200" in text
+    assert 'href="parts/bowl/report.html"' in page
+    without = text_of((make_study(tmp_path / "without", a_curve()) / "report.html").read_text())
+    assert "right on average" not in without
 
 
 def test_a_matrix_has_a_colour_for_each_share(tmp_path: Path) -> None:
@@ -111,10 +115,10 @@ def test_only_words_that_are_shown_are_explained(tmp_path: Path) -> None:
 
 
 def test_an_attack_without_a_page_has_no_link(tmp_path: Path) -> None:
-    run = make_study(tmp_path / "study", a_gap())
-    (run / "parts" / "camera" / "report.html").unlink()
-    page = write_page(run, a_gap()).read_text()
-    assert "parts/pose/" in page and "parts/camera/" not in page
+    run = make_study(tmp_path / "study", two_objects())
+    (run / "parts" / "bowl" / "report.html").unlink()
+    page = write_page(run, two_objects()).read_text()
+    assert "parts/mug/" in page and "parts/bowl/" not in page
 
 
 @pytest.mark.parametrize(
@@ -142,20 +146,20 @@ def test_any_result_has_a_page(tmp_path: Path, result: Result, said: list[str]) 
 
 
 def test_the_dashboard_and_a_bundle_have_the_pages_of_the_attacks(tmp_path: Path) -> None:
-    run = make_study(tmp_path / "study", a_gap())
+    run = make_study(tmp_path / "study", two_objects())
     with serving(run) as server:
-        assert "parts/pose/report.html" in got(f"{server.address}runs/study/")
-        assert got(f"{server.address}runs/study/parts/pose/report.html").endswith("the attack pose")
-        (run / "parts" / "camera" / "report.html").unlink()
-        for path in ("camera", "none", "..", "%2e%2e", "..%2f..%2fstudy"):
+        assert "parts/mug/report.html" in got(f"{server.address}runs/study/")
+        assert got(f"{server.address}runs/study/parts/mug/report.html").endswith("the attack mug")
+        (run / "parts" / "bowl" / "report.html").unlink()
+        for path in ("bowl", "none", "..", "%2e%2e", "..%2f..%2fstudy"):
             with pytest.raises(HTTPError, match="404"):
                 got(f"{server.address}runs/study/parts/{path}/report.html")
     assert main(["view", str(run), "--bundle", str(tmp_path / "site")]) == 0
-    page = (tmp_path / "site" / "parts" / "pose" / "report.html").read_text()
-    assert "the attack pose" not in page  # which anybody may have written; it is made anew
+    page = (tmp_path / "site" / "parts" / "mug" / "report.html").read_text()
+    assert "the attack mug" not in page  # which anybody may have written; it is made anew
     assert "<h1>" in page
-    assert "parts/pose/report.html" in (tmp_path / "site" / "index.html").read_text()
-    assert not (tmp_path / "site" / "parts" / "camera").exists()
+    assert "parts/mug/report.html" in (tmp_path / "site" / "index.html").read_text()
+    assert not (tmp_path / "site" / "parts" / "bowl").exists()
 
 
 def test_notes_on_files_stand_outside_of_the_yellow_box() -> None:

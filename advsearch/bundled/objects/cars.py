@@ -311,4 +311,4 @@ def car(draw: Draw) -> Instance:
         "well": solid("0a0a0b"),
     }  # fmt: skip
     detail = {"rubber": 0.3, "well": 0.15, "rim": 0.35, "trim": 0.7, "plate": 3.0}
-    return Instance(shapes.stretched(patches, stretch), paints, FINISHES["paint"], detail, FINISHES)
+    return Instance(shapes.stretched(patches, stretch), paints, FINISHES["paint"], detail, FINISHES, drives=True)

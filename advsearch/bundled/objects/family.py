@@ -134,6 +134,7 @@ class Instance:
     # of an object of several materials, what each tag is like; its tags are then names of materials
     finishes: Mapping[str, Material] = field(default_factory=dict)
     rig: MeshRig | None = None  # what moves the vertices of all patches, in the order of the patches
+    drives: bool = False  # as `ObjectAsset.drives`
 
 
 @dataclass(frozen=True)
@@ -172,7 +173,7 @@ class ObjectFamily:
             name=self.name, mesh=mesh, base_color=painted(patches, charts, instance.paints, self.texels),
             material=instance.material, label=self.label, source=BUNDLED_OBJECT,
             surface=finished(mesh, instance.finishes, instance.material) if instance.finishes else None,
-            finishes=instance.finishes, metres=round(float(extent) * self.metres, 4),
+            finishes=instance.finishes, metres=round(float(extent) * self.metres, 4), drives=instance.drives,
         )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from advsearch.cli.output import at_work
 from advsearch.options import rounded
 from advsearch.runs.exporters import Exported, Exporter
-from advsearch.runs.files import placed_by, replacing
+from advsearch.trust.writing import placed_by, replacing
 
 USUAL_SIZE = 100.0  # longest side of a printed object whose size is not known, in millimetres
 

@@ -21,10 +21,10 @@ from torch import Tensor, nn
 
 from advsearch.errors import InputError, ModelError
 from advsearch.models.model import warn
-from advsearch.models.probe import foreign
 from advsearch.models.source import Source, source_of
 from advsearch.models.zoo.library import Loaded, Processing, measured, nearly
 from advsearch.models.zoo.zero_shot import spoken
+from advsearch.trust.foreign_code import foreign
 
 QUESTION = "What is this? Answer with its name only."  # what is asked where nothing else is said
 

@@ -9,10 +9,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import logging
-import os
 import re
-import socket
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -26,9 +23,11 @@ from torch import Tensor, nn
 
 from advsearch.errors import CodeNotAllowedError, ModelError
 from advsearch.models.model import Triple, warn
-from advsearch.models.probe import first_line
 from advsearch.models.source import Purpose, Source, source_of
-from advsearch.registry import how_to_allow, may_fetch
+from advsearch.trust.archives import without_unpickling
+from advsearch.trust.code import how_to_allow, may_fetch
+from advsearch.trust.foreign_code import first_line
+from advsearch.trust.network import connecting
 
 
 def library(name: str, spec: str, extra: str) -> Any:
@@ -45,47 +44,6 @@ def library(name: str, spec: str, extra: str) -> Any:
             f"each other: {command}, torch's own index where that has them; or export the network with torch.export "
             f"where {name} works, and give the .pt2 file"
         ) from error
-
-
-@contextlib.contextmanager
-def without_unpickling() -> Iterator[None]:
-    """Hold `torch.load` to tensors and plain containers, whoever calls it and whatever it asks for."""
-    switches = ("TORCH_FORCE_WEIGHTS_ONLY_LOAD", "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD")
-    before = {key: os.environ.pop(key) for key in switches if key in os.environ}
-    os.environ[switches[0]] = "1"
-    try:
-        yield
-    finally:
-        for key in switches:
-            os.environ.pop(key, None)
-        os.environ.update(before)
-
-
-@contextlib.contextmanager
-def connecting(allowed: bool, tries: list[object]) -> Iterator[None]:
-    """Let this thread connect to nobody inside the block, unless that is allowed; each try is noted in `tries`."""
-    if allowed:
-        yield
-        return
-    names, thread = ("connect", "connect_ex"), threading.get_ident()
-    before = {name: getattr(socket.socket, name) for name in names}
-
-    def refusing(name: str) -> Callable[[socket.socket, Any], Any]:
-        def connect(self: socket.socket, address: Any) -> Any:
-            if threading.get_ident() != thread:
-                return before[name](self, address)
-            tries.append(address)
-            raise ConnectionRefusedError("only a file names this model")
-
-        return connect
-
-    for name in names:
-        setattr(socket.socket, name, refusing(name))
-    try:
-        yield
-    finally:
-        for name in names:
-            setattr(socket.socket, name, before[name])
 
 
 @contextlib.contextmanager

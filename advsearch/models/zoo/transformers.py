@@ -18,10 +18,10 @@ from torch.nn.functional import interpolate
 
 from advsearch.errors import ModelError, resembling
 from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.probe import first_line
 from advsearch.models.source import Purpose, Source, source_of
 from advsearch.models.zoo import language, outputs, zero_shot
 from advsearch.models.zoo.library import Adapted, Ask, Loaded, cached_file, in_pixels, library, processor_of, reading
+from advsearch.trust.foreign_code import first_line
 
 
 class Family(NamedTuple):

@@ -16,9 +16,9 @@ from torch.nn import functional
 from advsearch.errors import InputError, ModelError
 from advsearch.models.labels import patterns
 from advsearch.models.model import warn
-from advsearch.models.probe import foreign
 from advsearch.models.source import Source, sharing_copy
 from advsearch.models.zoo.library import Adapted, Ask, Loaded, in_pixels, nearly
+from advsearch.trust.foreign_code import foreign
 
 TEXTS = 64  # texts that are embedded at once
 

@@ -20,8 +20,8 @@ from advsearch.api.keywords import asks
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, asked_by, check_objective
 from advsearch.attacks.policies import POLICIES, WithoutAscent
-from advsearch.cluster import Call, Executor, Work
-from advsearch.cluster.dask_pool import executor_of
+from advsearch.cluster import Call, Workers, WorkerTask
+from advsearch.cluster.workers import open_workers
 from advsearch.config import SceneConfig, has_address, one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control, sentences
@@ -313,17 +313,17 @@ def judged_alone(config: AttackConfig) -> AttackConfig:
     return config.model_copy(update=change)
 
 
-def executor_for(config: SceneConfig, function: str, progress: Progress) -> AbstractContextManager[Executor | None]:
+def executor_for(config: SceneConfig, function: str, progress: Progress) -> AbstractContextManager[Workers | None]:
     """Return what carries out a function of a configuration, as its workers and cluster say; None for this process."""
     settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
-    work = Work(function, settings, FILES, config.used_threads or 1)
+    work = WorkerTask(function, settings, FILES, config.used_threads or 1)
     workers, cluster = (getattr(config, name, None) for name in ("workers", "cluster"))
     if (workers or cluster) and has_address(config.model):
         raise InputError(
             f"{'workers' if workers else 'cluster'}: a model behind an address is asked by one process, which counts "
             "its calls; leave it out"
         )
-    return executor_of(work, workers=workers, cluster=cluster, tell=progress.message)
+    return open_workers(work, workers=workers, cluster=cluster, tell=progress.message)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -420,7 +420,7 @@ def attack(
     parts = [PythonOnly("model", model_name(network)) for network in several(model) if naming.exists_here(network)]
     parts += [PythonOnly("scene")] if scene.only_here else []
     parts += [PythonOnly("task", task.name)] if isinstance(task, Task) and not is_named(task, make_task) else []
-    parts += [PythonOnly("objective", config.objective)] if callable(objective) else []
+    parts += [PythonOnly("objective", own_name)] if callable(objective) else []
     parts += (
         [PythonOnly("policy", policy.name)] if isinstance(policy, Policy) and not is_named(policy, policy_of) else []
     )

@@ -15,6 +15,7 @@ from advsearch.questions.attack.summary import (
     DifferentFailures,
     EpsilonBudget,
     MatrixResult,
+    ObjectRow,
 )
 from advsearch.report import shown as saying
 from advsearch.report import wording as words
@@ -186,6 +187,8 @@ def _shown_curve(result: CurveResult) -> ShownResult:
         "wrong": lambda row: f"{row.verified.successes}/{row.verified.trials}" if row.verified else "",
         "margin": lambda row: "" if row.margin is None else f"{row.margin:.2f}",
     }
+    if any(row.average for row in result.table):
+        by_object = {**by_object, "right on average": _average_text, "95 % interval": _average_interval}
     known = [point for point in result.curve if point.accuracy is not None]
     points = [point for point in known if point.epsilon is not None]
     listed = "; ".join(f"{point.robust} of {point.objects} at {point.epsilon:g}" for point in points)
@@ -200,6 +203,18 @@ def _shown_curve(result: CurveResult) -> ShownResult:
     meaning = ResultPart(text=[f"Margin: {words.margin_text(result.task)}, in the trials of the worst case."])
     sections = [*([chart] if points else []), *([curve] if known else []), objects, meaning]
     return ShownResult(_curve_text(result, known), sections, {"model": result.model, "policy": result.policy})
+
+
+def _average_text(row: ObjectRow) -> str:
+    """Return how many of the random configurations of an object are right; empty where none was drawn."""
+    if row.average is None:
+        return ""
+    share = words.percent(row.average.accuracy)
+    return f"{row.average.correct}/{row.average.configurations} ({share})"
+
+
+def _average_interval(row: ObjectRow) -> str:
+    return words.interval_text(row.average.interval) if row.average else ""
 
 
 def _curve_text(result: CurveResult, known: Sequence[CurvePoint]) -> str:
@@ -252,6 +267,9 @@ def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
             f"{point.already_wrong} are wrong as they are. {spent if total else ''}{saying.NO_PROOF}"
         )
         yield saying.claim("measured", text, extent)
+    for row in result.table:
+        if row.average is not None:
+            yield saying.average_claim(row.average, row.object)
 
 
 # ---- attacked on against tested on ----------------------------------------------------------------------------------

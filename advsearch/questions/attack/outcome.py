@@ -23,11 +23,12 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import UNPRINTED
 from advsearch.questions.attack.summary import AttackSummary, DifferentFailures
 from advsearch.report.wording import number_text
-from advsearch.runs.files import write_bytes
 from advsearch.runs.results import LinearTransport, SharedWork, VariedValue
 from advsearch.runs.summary import write_configuration
 from advsearch.tasks import Judgement
-from advsearch.tasks.base import mean
+from advsearch.tasks.base import Task, mean
+from advsearch.tasks.detection import Detection
+from advsearch.trust.writing import write_bytes
 from advsearch.viewer.pages import keep_result
 
 T = TypeVar("T")
@@ -65,7 +66,7 @@ def summarise(
             "judge": config.judge,
             "policy": config.policy_name,
             "command_line": config.command_line(),
-            "objective": objective or problem.task.objective,
+            "objective": name_objective(problem.task, objective),
             "warnings": [*warnings, *_remarks(findings, problem, journal)],
             "drive": drive,
             "shared": SharedWork.of_facts(journal.traced.facts, journal.machines),
@@ -206,8 +207,20 @@ def _searched(problem: Problem, search: SearchResult | None, adversarial: KeptPi
     return searched
 
 
+def name_objective(task: Task, objective: str | None) -> str:
+    """Name what a search maximised: a task's own score has the name of the goal that the task seeks.
+
+    "vanish" is what "score" means to a detector without a goal, so it stays "score".
+    """
+    named = objective or task.objective
+    goal = getattr(task, "seek", "")
+    if named == Task.objective and goal not in ("", Detection.seek):
+        return str(goal)
+    return named
+
+
 def _objective_over(trials: Sequence[Judgement]) -> dict[str, float] | None:
-    """None where it was not asked for, as in trials of an older run."""
+    """Return mean, deviation and range of the objective over trials; None where there are none."""
     values = [trial.objective for trial in trials if trial.objective is not None]
     if not values:
         return None

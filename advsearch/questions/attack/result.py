@@ -27,12 +27,10 @@ from advsearch.engine.record import KEPT, Findings
 from advsearch.engine.rendering import Rendering, pictures_of, render
 from advsearch.errors import InputError
 from advsearch.questions.attack.summary import AlongDrive, AttackSummary
-from advsearch.registry import names_code
 from advsearch.report.figures import marked, new_axes, search_axes
 from advsearch.report.shown import result_html, shown, side_by_side
 from advsearch.runs import files, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
-from advsearch.runs.files import write_bytes
 from advsearch.scene.assembly import posed
 from advsearch.scene.assets import Shape, simpler
 from advsearch.scene.description import OBJECT
@@ -42,6 +40,8 @@ from advsearch.scene.glb import web_glb
 from advsearch.scene.settings import Given
 from advsearch.settings import as_python
 from advsearch.tasks import Judgement, Mark
+from advsearch.trust.code import names_code
+from advsearch.trust.writing import write_bytes
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

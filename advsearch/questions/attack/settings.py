@@ -9,13 +9,14 @@ from pydantic import JsonValue, model_validator
 
 from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig, name_in, read_named
 from advsearch.files import JsonObject
-from advsearch.settings import Clash, power, setting, setting_as_in, split_names
+from advsearch.settings import Clash, setting, setting_as_in, split_names
+from advsearch.trust import powers
 
 TRIALS, TRIALS_OVER = 20, 200  # Fresh renders that check what a search found, and what holds for many conditions
 STEPS = 40  # Of a search about one picture
 OVER_PREDICTED, OVER_ONE, OVER_RENDERED, OVER_NUMBERS = (300, 8), (100, 4), (150, 4), (STEPS, 4)
 """Steps, and conditions that each looks at, of a search for many conditions: where a bank of light transport predicts
-pictures (`benchmarks/bank.py`), where that is so and conditions are one number (docs/drives.md), where each is
+pictures, where that is so and conditions are one number (docs/drives.md), where each is
 rendered, and where only a few numbers are searched (a pose)."""
 FEWEST_TRIALS = 6
 """With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
@@ -57,9 +58,8 @@ class AttackConfig(DerivativeConfig):
                   & {part for name in map(instance, asked.over) for part in (name, name.rpartition(":")[2])}
               ),
               "names a control that varies by chance, whose derivative nobody asks for; leave it out"),
-        Clash("average", lambda asked: asked.command == "attack" and asked.is_curve,
-              "is not part of a curve; `advsearch gap` compares with the average, or name one `object` and one "
-              "`epsilon`"),
+        Clash("average", lambda asked: asked.epsilons,
+              "is the average within one epsilon; name one `epsilon`, or leave `average` out"),
     )
 
     object: str = setting_as_in(
@@ -119,7 +119,7 @@ class AttackConfig(DerivativeConfig):
     )
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
         None, "run", "experiment tracker to which every evaluation is sent; its package has to be installed",
-        otherwise="none", power=power.tracker,
+        otherwise="none", power=powers.tracker,
     )
     over: ControlsByName = setting_as_in(
         SceneConfig, "controls", default=dict,
@@ -172,11 +172,11 @@ class AttackConfig(DerivativeConfig):
     workers: int | None = setting(
         None, "run",
         "worker processes; they share the attacks of several objects or models, or the independent renders of one",
-        otherwise="this one alone", unit="processes", ge=1, le=100_000, power=power.many_processes,
+        otherwise="this one alone", unit="processes", ge=1, le=100_000, power=powers.many_processes,
     )
     cluster: str | None = setting(
         None, "run", "where the workers are", "the address of a Dask scheduler, local, or a .yaml file",
-        metavar="PLACE", otherwise="this machine, if there are `workers`", min_length=1, power=power.connection,
+        metavar="PLACE", otherwise="this machine, if there are `workers`", min_length=1, power=powers.connection,
     )
     # fmt: on
 

@@ -100,7 +100,7 @@ class Attack:
         problem, config, stored = self.problem, self.config, self.journal.note(PLAN)
         if stored is not None:
             problem.plan = problem.plan.restored(stored["plan"])
-            problem.spp, problem.search_depth = stored["spp"], stored.get("search_depth")
+            problem.spp, problem.search_depth = stored["spp"], stored["search_depth"]
             return
         worth = config.specialise and (config.measure == "full" or problem.steps >= planning.WORTH_BOUNCES)
         against = surface_light.refusal_of_surface_light(problem, problem.steps, self.policy, config.specialise)

@@ -18,14 +18,12 @@ from typing import Any
 import torch
 
 from advsearch import seeds
-from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
-from advsearch.cluster import Call, Work
-from advsearch.cluster.dask_pool import executor_of
-from advsearch.config import CONFIGS
+from advsearch.cluster import Call, WorkerTask
+from advsearch.cluster.workers import open_workers
 from advsearch.engine.journal import worker_call
 from advsearch.engine.judging import one_label_for_several
-from advsearch.engine.naming import check_run_settings, different, load_models, settings_alone
+from advsearch.engine.naming import different, load_models
 from advsearch.engine.record import control_group, verified_rate
 from advsearch.engine.transport import CleanMatrix
 from advsearch.engine.verifier import RetrialCondition, Retrials
@@ -37,15 +35,15 @@ from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack import summary as results
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
-from advsearch.runs import files
 from advsearch.runs.directory import CONFIG, PARTS, default_name, is_run
-from advsearch.runs.files import PART, storage_errors, write_bytes
 from advsearch.runs.listing import finished
 from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.runs.summary import read_configuration, read_result
 from advsearch.scene.library import list_objects, load_object
 from advsearch.settings import FILES, Config
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import make_task
+from advsearch.trust.writing import LOCK, PART, storage_errors, write_bytes
 
 
 def carry_out_part(path: Path, config: Config, progress: Progress, ask: Callable[..., Result] | None = None) -> Result:
@@ -68,7 +66,7 @@ ALL = "all"  # What an ensemble is called among the models that were attacked
 @dataclass(frozen=True)
 class StudyAttack:
     """One attack of a study: what it is carried out with, the name of its folder, and what tells it from the others: an
-    object, a control of it, or a model. The epsilon is that of a curve, or None."""
+    object or a model. The epsilon is that of a curve, or None."""
 
     config: AttackConfig
     name: str
@@ -80,17 +78,9 @@ Chain = list[StudyAttack]  # Attacks that follow one another, until one finds so
 
 
 def chains_of(config: AttackConfig) -> list[Chain]:
-    """Return the attacks of a study: of a gap, a matrix or a curve. Raises InputError where none of the controls takes
-    a setting, or a name comes twice."""
+    """Return the attacks of a study: of a matrix or a curve. Raises InputError where a name comes twice."""
     chains: list[Chain] = []
-    if config.command == "gap":
-        check_run_settings(config)
-        for place, name in enumerate(different(config.objects, "object")):
-            for number, (control, settings) in enumerate(config.controls.items()):
-                changes = {"controls": {control: settings}, **settings_alone(config, control, settings)}
-                folder = f"{place:02d}-{number:02d}-" + default_name(name, [control])
-                chains.append([StudyAttack(AttackConfig.of(config, object=name, **changes), folder, control)])
-    elif config.is_matrix:
+    if config.is_matrix:
         names = different(config.models, "model")
         for place, name in enumerate([ALL] if config.ensemble else names):
             alone = AttackConfig.of(config, **({} if config.ensemble else {"model": name}))
@@ -108,9 +98,7 @@ def chains_of(config: AttackConfig) -> list[Chain]:
 
 def attacks_of(settings: JsonObject) -> Call:
     """Return what carries out the attacks of the study that the settings describe: what a worker does."""
-    config = CONFIGS[str(settings["command"])](**{k: v for k, v in settings.items() if k != "command"})
-    assert isinstance(config, AttackConfig)
-    chains = chains_of(config)
+    chains = chains_of(AttackConfig(**settings))
 
     def call(numbers: Sequence[int]) -> list[tuple[str, str, dict[str, bytes]]]:
         carried_out, clean = [], CleanMatrix()
@@ -119,7 +107,7 @@ def attacks_of(settings: JsonObject) -> Call:
                 path = Path(folder) / part.name
                 config_there = part.config.model_copy(update={"run": str(path), "overwrite": True})
                 ending = attacking.attack_once(config_there, clean=clean).summary.ending
-                kept = (file for file in path.rglob("*") if file.is_file() and file.name != files.NAME)
+                kept = (file for file in path.rglob("*") if file.is_file() and file.name != LOCK)
                 read = {file.relative_to(path).as_posix(): file.read_bytes() for file in kept}
                 carried_out.append((part.name, str(path), read))
                 if ending in SETTLED:
@@ -133,11 +121,11 @@ def share(config: AttackConfig, chains: Sequence[Chain], run: Path, progress: Pr
     """Have the attacks of a study that are not begun carried out by workers into its folder, where some were asked for.
     Raises ClusterError: every worker died of an attack, or there are none."""
     left = [number for number, chain in enumerate(chains) if not any(is_run(run / PARTS / part.name) for part in chain)]
-    plain = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
-    settings, threads = {"command": config.command, **plain}, config.used_threads or 1
-    work = Work("advsearch.questions.attack.studies:attacks_of", settings, FILES, threads, seconds=LONGEST)
+    settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
+    threads = config.used_threads or 1
+    work = WorkerTask("advsearch.questions.attack.studies:attacks_of", settings, FILES, threads, seconds=LONGEST)
     workers, cluster = (config.workers, config.cluster) if left else (None, None)
-    with executor_of(work, workers=workers, cluster=cluster, tell=progress.message) as executor:
+    with open_workers(work, workers=workers, cluster=cluster, tell=progress.message) as executor:
         if executor is None:
             return
         progress.stage("attacks on workers", len(left))

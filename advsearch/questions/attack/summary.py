@@ -207,7 +207,7 @@ class Printability(Fields):
 
     clean: PrintTerms = Field(description="of the clean scene")
     answer: PrintTerms | None = Field(description="of the adversarial scene; null if nothing was searched")
-    cost: PrintCost | None = optional("what the terms cost in margin; null if nothing was verified, and in older runs")
+    cost: PrintCost | None = optional("what the terms cost in margin; null if nothing was verified")
 
 
 class AmbientPoint(Fields):
@@ -311,9 +311,8 @@ class ObjectRow(Fields):
     margin: JsonFloat | None = optional("mean of the trials, in logits")
     run: str | None = None
     tried: float | None = optional("the largest epsilon that was tried")
-    renders: dict[str, int] | None = optional(
-        "pictures by kind, of the attacks at all epsilons together; null in older runs"
-    )
+    average: AverageCase | None = optional("only with `average`")
+    renders: dict[str, int] | None = optional("pictures by kind, of the attacks at all epsilons together")
 
 
 class CurvePoint(Fields):

@@ -106,7 +106,7 @@ def compare(asked: RunContext[CompareConfig]) -> CompareResult:
     # these import torch and pandas
     from advsearch.questions.attack.studies import carry_out_part
     from advsearch.questions.compare.pairs import PairPictures, compared, differing, read_sides
-    from advsearch.rules import interval_of
+    from advsearch.rules import interval_of, share_of
     from advsearch.runs.tables import count_wrong_outcomes
 
     config, progress, renders = asked.config, asked.progress, 0
@@ -145,7 +145,7 @@ def compare(asked: RunContext[CompareConfig]) -> CompareResult:
                 **side.named,
                 configurations=len(side.rows),
                 correct=int(side.right.sum()),
-                accuracy=float(side.right.mean()),
+                accuracy=share_of(side.rows),
                 interval=interval_of(side.rows),
                 outcomes=count_wrong_outcomes(side.rows),
                 seconds=float(side.rows["seconds"].mean()),
@@ -167,6 +167,9 @@ def _cautions(sides: Sequence[Side], names: Sequence[str]) -> list[str]:
         cautions.append(f"The sweeps differ in {listed}: what is told here is of all of that together.")
     if not names:
         cautions.append("The sweeps have the same settings: what differs is in files, in versions, or in the machine.")
+    if len(sides[0].rows) > 1 and sides[0].rows["unit"].nunique() == 1:
+        name = sides[0].rows.attrs["unit name"]
+        cautions.append(f"All pairs are of one {name}: the shares are of this one, and nothing is shown of others.")
     tasks = {side.summary.task for side in sides}
     if len(tasks) > 1:
         cautions.append(f"What counts as right is judged by different tasks: {', '.join(sorted(tasks))}.")

@@ -19,7 +19,6 @@ import numpy.typing as npt
 import pandas as pd
 
 from advsearch import seeds
-from advsearch.attacks.trials import paired_by_unit
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.experiment import RunContext
 from advsearch.questions.compare.result import ComparedPair, CountOf, PairPart, PairPicture, PairRule
@@ -28,18 +27,19 @@ from advsearch.questions.sweep.job import OpenScenes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.wording import short_names
-from advsearch.rules import FEWEST_ROWS, find_rules, halves, interval_of, is_shown, observed
+from advsearch.rules import FEWEST_ROWS, find_rules, halves, interval_of, is_shown, observed, share_of
 from advsearch.runs.directory import CONFIG
-from advsearch.runs.files import write_bytes
 from advsearch.runs.summary import read_result
 from advsearch.runs.tables import read_sweep
+from advsearch.statistics.clustered import mean_share, paired_by_unit, per_unit
+from advsearch.trust.writing import write_bytes
 from advsearch.viewer import thumbnails
 
 DRAWS = ("grid", "controls", "samples", "sampler", "seed")  # The settings that decide what is drawn
 OF_THE_SIDE = ("object", "model", "answer")  # What may tell sides apart, as rows have it
 FOLLOWS = (
-    *(*DRAWS, "label", "labels", "prompt", "up", "size", "unit", "batch", "keep_pictures", "trials", "verify_spp"),
-    *("specialise", "value_range"),
+    *(*DRAWS, "label", "labels", "prompt", "up", "facing", "size", "unit", "batch", "keep_pictures", "trials"),
+    *("verify_spp", "specialise", "value_range"),
 )
 """Settings that do not tell sweeps apart: of draws, along with object and model, or of no adversarial scene."""
 TOLERANCE = 1e-4  # Of a value, relative to the largest in its column: values come from single precision
@@ -109,7 +109,7 @@ def _sides_of(folder: Path, *, alone: bool) -> Iterator[Side]:
             f"{folder}: expected a sweep that has ended, got one with {summary.looked_at} of {summary.planned} "
             f"predictions; go on with it: advsearch resume {folder}"
         )
-    config, rows = SweepConfig.from_yaml(folder / CONFIG), read_sweep(folder)
+    config, rows = SweepConfig.from_yaml(folder / CONFIG), read_sweep(folder, is_drawn=summary.sampler is not None)
     if len(rows) != summary.planned or not rows["step"].is_unique:
         raise FileFormatError(
             f"{folder}: expected {summary.planned} rows, as its summary says, got {len(rows)}; sweep again"
@@ -186,6 +186,7 @@ def compared(first: Side, second: Side, seed: int, *, rules: bool = True) -> Com
         first=first.name,
         second=second.name,
         units=None if draws == len(units) else draws,
+        unit=first.rows.attrs["unit name"],
         **_counts(right, other, units),
         p=paired_by_unit(right, other, units)[2],
         worse=worse,
@@ -214,7 +215,9 @@ def _counts(first: Mask, second: Mask, units: npt.NDArray[np.int64]) -> dict[str
         "neither": ~first & ~second,
     }
     counts = {name: int(those.sum()) for name, those in pairs.items()}
-    return {**counts, "difference": difference, "interval": interval}
+    of = per_unit(np.ones(len(units)), units)
+    shares = tuple(mean_share(per_unit(right, units), of) for right in (first, second))
+    return {**counts, "shares": shares, "difference": difference, "interval": interval}
 
 
 def _parts(column: pd.Series, edges: Sequence[float] | None) -> Iterator[tuple[Any, Mask]]:
@@ -235,7 +238,8 @@ def _rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
 
     def count(pairs: pd.DataFrame) -> CountOf:
         low, high = interval_of(pairs)
-        return CountOf(count=int((~pairs["correct"]).sum()), total=len(pairs), interval=(1.0 - high, 1.0 - low))
+        interval, share = (1.0 - high, 1.0 - low), 1.0 - share_of(pairs) if len(pairs) else None
+        return CountOf(count=int((~pairs["correct"]).sum()), total=len(pairs), interval=interval, share=share)
 
     rules = []
     for rule in find_rules(*halves(table, seed), seeds.stream(seed, "compare")).told:

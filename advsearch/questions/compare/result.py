@@ -34,6 +34,10 @@ class CountOf(Fields):
     count: int
     total: int = Field(alias="of", description="pairs")
     interval: Interval = Field(description="of the share, 95 %")
+    share: float | None = Field(
+        default=None,
+        description="of all; where pairs share draws, the mean over draws of the share of each; absent of older runs",
+    )
 
 
 class PairCounts(Fields):
@@ -43,6 +47,11 @@ class PairCounts(Fields):
     first_only: int = Field(description="that the first alone gets right")
     second_only: int = Field(description="that the second alone gets right")
     neither: int = Field(description="that none gets right")
+    shares: tuple[float, float] | None = Field(
+        default=None,
+        description="accuracy of the first and of the second; where pairs share draws, means over draws of the share "
+        "of each; absent of older runs",
+    )
     difference: float = Field(description="accuracy of the second less that of the first")
     interval: Interval = Field(description="of that difference, 95 %, of pairs")
 
@@ -54,6 +63,11 @@ class PairCounts(Fields):
     def right(self) -> tuple[int, int]:
         """Right predictions of the first, and of the second."""
         return self.both + self.first_only, self.both + self.second_only
+
+    @property
+    def accuracies(self) -> tuple[float, float]:
+        first, second = self.right
+        return self.shares or (first / self.pairs, second / self.pairs)
 
 
 class PairRule(CountOf):
@@ -91,6 +105,7 @@ class ComparedPair(PairCounts):
         description="draws that the pairs are of, such as [drives](drives.md), where some share one; absent where none "
         "do",
     )
+    unit: str = Field(default="drive", description="what such a draw is: a drive, a picture or a configuration")
     p: float = Field(
         description="how likely a split so uneven of the pairs that one alone gets right is where both are right "
         "equally often (two-sided; McNemar's exact test, or where pairs share draws a bound by bets)"
@@ -128,8 +143,8 @@ NOTE = (
     "Clopper-Pearson's, each for its row by itself."
 )
 NOTE_OF_UNITS = (
-    f"{LIKELY}(at most, two-sided). Frames of one drive are not independent: p and intervals are over drives, by bets, "
-    "each for its row by itself."
+    f"{LIKELY}(at most, two-sided). Frames of one drive are not independent, nor are pictures of one configuration: p "
+    "and intervals are over {units}, by bets, each for its row by itself. All {units} weigh the same."
 )
 
 LEVEL = 0.05  # A p-value up to this is called a difference
@@ -162,10 +177,11 @@ def shown(result: CompareResult) -> ShownResult:
 
 def headline(pair: ComparedPair) -> str:
     """Return the first thing that a reader should know of two sides, in a sentence."""
-    n, (before, after) = pair.pairs, pair.right
+    before, after = map(percent, pair.accuracies)
+    of_units = "" if pair.units is None else f" of {wording.count(pair.units, pair.unit)}"
     return (
-        f"{pair.first} is right in {percent(before / n)} and {pair.second} in {percent(after / n)} of the same "
-        f"{wording.count(n, 'picture')}{'' if pair.units is None else f' of {pair.units} drives'}: a difference of "
+        f"{pair.first} is right in {before} and {pair.second} in {after} of the same "
+        f"{wording.count(pair.pairs, 'picture')}{of_units}: a difference of "
         f"{100.0 * pair.difference:+.1f} points "
         f"(95 % interval {points_text(pair.interval)})."
     )
@@ -181,9 +197,10 @@ def alone_text(pair: ComparedPair) -> str:
         return "Both are right about the same pictures."
     shown = "" if pair.p <= LEVEL else ". That there is a difference is not shown"
     p = f"= {pair.p:.2g}" if pair.p >= 0.0001 else "< 0.0001"
+    test = "exact McNemar test" if pair.units is None else f"by {pair.unit}"
     return (
         f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in {pair.second_only} "
-        f"({'exact McNemar test, ' if pair.units is None else 'by drive, '}p {p}){shown}."
+        f"({test}, p {p}){shown}."
     )
 
 
@@ -194,7 +211,7 @@ def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[ResultPart]:
         [f"{pair.first} right", str(pair.both), str(pair.first_only)],
         [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
     ]
-    note = NOTE if pair.units is None else NOTE_OF_UNITS
+    note = NOTE if pair.units is None else NOTE_OF_UNITS.format(units=f"{pair.unit}s")
     yield ResultPart(f"{pair.first} and {pair.second}, pair by pair", said, heads, rows, note)
     yield ResultPart("Where one is worse", [*_rules_texts(pair)])
     tables: dict[str, list[PairPart]] = {}
@@ -208,7 +225,7 @@ def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[ResultPart]:
     for name, parts in tables.items():
         rows = []
         for part in parts:
-            shares = [percent(right / part.pairs) for right in part.right]
+            shares = [percent(accuracy) for accuracy in part.accuracies]
             difference = f"{100.0 * part.difference:+.0f} ({points_text(part.interval)})"
             alone = [str(part.first_only), str(part.second_only)]
             rows.append([wording.value_text(part.value), str(part.pairs), *shares, difference, *alone])
@@ -231,7 +248,9 @@ def _rules_texts(pair: ComparedPair) -> Iterator[str]:
             yield f"{where} no values stand out from chance."
         for number, rule in enumerate(rules if rules and alone_right else ()):
             rest = "elsewhere" if number == 0 else "in what no rule before covers"
-            inside, outside = (share_of_text(one.count, one.total, one.interval) for one in (rule, rule.elsewhere))
+            inside, outside = (
+                share_of_text(one.count, one.total, one.interval, one.share) for one in (rule, rule.elsewhere)
+            )
             yield f"{where} {conditions_text(rule.conditions)}, in {inside} pairs; {rest} in {outside}."
 
 
@@ -259,10 +278,10 @@ def _alone(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
 
 def claims(result: CompareResult) -> Iterator[Claim]:
     for pair in result.pairs:
-        how = "Newcombe's, of pairs" if pair.units is None else "over drives"
+        how = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
         text = f"{headline(pair)} {alone_text(pair)} The interval of the difference is {how}."
         side = next(side for side in result.sides if side.name == pair.second)
         what = f"configurations in which {pair.second} is right"
         others = wording.outcomes_text(side.outcomes, result.task)
         text += f" Of the others {pair.second} has {others}." if others else ""
-        yield claim("measured", text, counted(what, side.correct, side.configurations, side.interval))
+        yield claim("measured", text, counted(what, side.correct, side.configurations, side.interval, side.accuracy))

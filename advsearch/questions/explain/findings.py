@@ -34,10 +34,10 @@ from scipy.stats import chi2, ncf, ncx2
 from scipy.stats import f as fisher
 
 from advsearch import rules
-from advsearch.attacks.trials import CONFIDENCE
 from advsearch.questions.explain.result import EnvelopeRow, ParameterWeight, RightOf, RuleNotTold
-from advsearch.rules import CountedRule, RuleCondition, RuleConditions, covered, interval_of
+from advsearch.rules import CountedRule, RuleCondition, RuleConditions, covered, interval_of, merge_repeats, share_of
 from advsearch.runs.tables import count_wrong_outcomes
+from advsearch.statistics.intervals import CONFIDENCE
 
 MOST_PARTS = 20
 ROWS_IN_A_CELL = 25  # Rows that a cell of two factors' parts has on average, at least
@@ -53,6 +53,7 @@ def find_importance(table: pd.DataFrame) -> list[ParameterWeight]:
     decide together more than each of the two by itself. Nothing where the predictions are all the same."""
     if table["correct"].nunique() < 2:
         return []
+    table = merge_repeats(table)
     predictions, factors = _Predictions(table), list(table.attrs["units"])
     fine, few = round(predictions.count ** (1.0 / 3.0)), max(2, math.isqrt(predictions.count // ROWS_IN_A_CELL))
     alone = [predictions.weight([factor], _parts(table[factor], fine)) for factor in factors]
@@ -76,20 +77,22 @@ def _parts(column: pd.Series, most: int) -> Places:
 
 
 class _Predictions:
-    """The predictions of a table: (n,) whether they are right, and the number of the unit of each."""
+    """The predictions of a table: (n,) whether they are right, the number of the unit of each, and its weight: all
+    units weigh the same, so that few with many rows do not decide; 1 on average."""
 
     def __init__(self, table: pd.DataFrame) -> None:
         self.right: npt.NDArray[np.bool_] = table["correct"].to_numpy()
         units, self.units = np.unique(table["unit"], return_inverse=True)
         self.count, self.independent = len(units), table["unit"].is_unique
-        self.variance = float(self.right.mean()) * (1.0 - float(self.right.mean()))
+        self.weights = len(self.right) / self.count / np.bincount(self.units)[self.units]
+        self.mean = float(np.average(self.right, weights=self.weights))
+        self.variance = self.mean * (1.0 - self.mean)
 
     def between(self, parts: Places) -> tuple[float, int]:
         """The share of the variance between parts as it is counted, and the number of parts that have rows."""
-        seen = np.bincount(parts)
-        rate = np.bincount(parts, self.right)[seen > 0] / seen[seen > 0]
-        mean = float(self.right.mean())
-        return float((seen[seen > 0] * (rate - mean) ** 2).sum()) / len(self.right) / self.variance, len(rate)
+        seen = np.bincount(parts, self.weights)
+        rate = np.bincount(parts, self.weights * self.right)[seen > 0] / seen[seen > 0]
+        return float((seen[seen > 0] * (rate - self.mean) ** 2).sum()) / len(self.right) / self.variance, len(rate)
 
     def weight(self, factors: list[str], parts: Places) -> ParameterWeight:
         (counted, k), n, by_chance = self.between(parts), len(self.right), self.by_chance(parts)
@@ -108,12 +111,12 @@ class _Predictions:
     def by_chance(self, parts: Places) -> float:
         """What chance adds to the statistic of some parts, from how much units deviate: k - 1 where predictions are
         independent; NaN where too few units say it."""
-        seen, right = np.bincount(parts), self.right
+        seen, right = np.bincount(parts, self.weights), self.right
         if self.independent:
             return float((seen > 0).sum() - 1)
-        rate = np.bincount(parts, right) / np.maximum(seen, 1)
+        rate = np.divide(np.bincount(parts, self.weights * right), seen, out=np.zeros(len(seen)), where=seen > 0)
         both, places = np.unique(parts * self.count + self.units, return_inverse=True)
-        away = np.bincount(places.reshape(-1), right - rate[parts])
+        away = np.bincount(places.reshape(-1), self.weights * (right - rate[parts]))
         of, unit = both // self.count, both % self.count
         in_part = np.bincount(of, minlength=len(seen))
         if self.count < 2 or self.count <= (seen > 0).sum() or (in_part[seen > 0] < 2).any():
@@ -165,6 +168,8 @@ RESERVE = 0.01  # By how much more the choosing rows have to show, since they we
 def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: float) -> EnvelopeRow | None:
     """Return the largest box that promises an accuracy in (0, 1), the lower end of a 95 % interval; None where no box
     of enough rows does. Some rows choose the box, and others try it, once."""
+    if choosing.empty:
+        return None
     conditions: RuleConditions = ()
     inside, independent = choosing, choosing["unit"].is_unique
     while interval_of(inside)[0] < min(accuracy + RESERVE, (1.0 + accuracy) / 2.0):
@@ -207,10 +212,12 @@ def _peeled(conditions: RuleConditions, inside: pd.DataFrame) -> Iterator[RuleCo
 
 
 def right_of(rows: pd.DataFrame) -> RightOf:
+    """Count right rows; their share is the mean over units."""
     return RightOf(
         right=int(rows["correct"].sum()),
         total=len(rows),
         interval=interval_of(rows),
+        share=None if rows.empty else share_of(rows),
         outcomes=count_wrong_outcomes(rows),
     )
 
@@ -218,7 +225,12 @@ def right_of(rows: pd.DataFrame) -> RightOf:
 def cautions(table: pd.DataFrame, importance: Sequence[ParameterWeight]) -> list[str]:
     """Return what a reader has to know of the rows of a table and of what decides."""
     texts, draws = list[str](), table["unit"].nunique()
-    if draws < rules.FEWEST_ROWS:
+    if draws == 1:
+        texts.append(
+            "The rows are of one draw: a single drive, or pictures that differ in noise alone. The shares are of this "
+            "one, and nothing is shown of others."
+        )
+    elif draws < rules.FEWEST_ROWS:
         texts.append(f"The rows are of {draws} draws, each with several, which are not independent: few show little.")
     if table["correct"].nunique() < 2:
         always = "right" if table["correct"].all() else "wrong"

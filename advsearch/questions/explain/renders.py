@@ -42,6 +42,8 @@ SIDES, LEAST_LEFT = 2, 0.2
 """Arcs of a circle that a condition has, at most. Share of a rule that no rule before it covers, from which on more is
 rendered so that enough of it is left."""
 OUTER = ("object", "environment", "model")
+EXTENT = ("samples", "keep_pictures", "surface", "trials", "verify_spp")
+"""Settings of a sweep that do not change what a picture with a number is, nor what is said of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,32 +63,56 @@ class AskedSweep:
 
 
 def read_predictions(sweeps: Sequence[AskedSweep]) -> pd.DataFrame:
-    """Return the rows of some sweeps as one frame (`runs.tables`), with the number of their `sweep`; sweeps of the same
-    draws share their units, so that two models' are not told twice. Object, environment and model are called as figures
-    call them, and what a sweep has no parameter for is missing."""
-    frames, draws = [], []
+    """Return the rows of some sweeps as one frame (`runs.tables`), with the number of their `sweep`; what is the same
+    draw is one unit (`draw_names`), and the same picture, come again in a longer sweep of the same seed, is left out
+    (`picture_names`). Object, environment and model are called as figures call them, and what a sweep has no parameter
+    for is missing."""
+    frames = []
     for number, sweep in enumerate(sweeps):
-        rows = read_sweep(sweep.folder).sort_values("step", ignore_index=True)
+        is_drawn = sweep.summary.sampler is not None
+        rows = read_sweep(sweep.folder, is_drawn=is_drawn).sort_values("step", ignore_index=True)
         for name in OUTER:
             called = rows[name].astype(object) if name in rows else pd.Series(getattr(sweep.summary, name), rows.index)
             rows[name] = called.map(figure_value)
-        if sweep.summary.sampler is None:  # samples of a point differ by noise alone
-            rows["unit"] //= sweep.summary.samples
-        deciding = sweep.config.deciding()
-        draws.append(f"{[deciding[name] for name in ('grid', 'controls', 'samples', 'sampler', 'seed')]}")
+        rows["draw"], rows["picture"] = draw_names(sweep, rows), picture_names(sweep, rows)
         frames.append(rows.assign(sweep=number))
     units = {name: unit for frame in frames for name, unit in frame.attrs["units"].items()}
     units = {**units, **dict.fromkeys(OUTER, "")}
     table = pd.concat(frames, ignore_index=True)
+    table = table[~table.duplicated("picture")].reset_index(drop=True)
     for name in units:
         if not pd.api.types.is_float_dtype(table[name]):
             table[name] = table[name].astype("category")
-    draw_of = [sorted({*draws}).index(draw) for draw in draws]
-    named = [f"{unit} {draw_of[sweep]}" for unit, sweep in zip(table["unit"], table["sweep"], strict=True)]
-    table["unit"] = np.unique(named, return_inverse=True)[1]
+    table["unit"] = np.unique(table["draw"], return_inverse=True)[1]
+    table = table.drop(columns=["draw", "picture"])
     table["correct"] = (table["correct"] == 1) & is_shown(table)
     table.attrs["units"] = units
     return table
+
+
+def draw_names(sweep: AskedSweep, rows: pd.DataFrame) -> list[str]:
+    """Return the name of the draw that each row (n,) of a sweep is of, the same in another sweep of the same draw.
+
+    What is drawn follows from the seed and the number of the draw, however many there are and whatever they are placed
+    in: sweeps of one seed share their draws. Where nothing is drawn, pictures of the same values, or drives that begin
+    with the same, differ in noise alone.
+    """
+    if sweep.summary.sampler is not None:
+        return [f"draw {sweep.config.seed} {unit}" for unit in rows["unit"]]
+    names = [name for name in (*OUTER[:2], *rows.attrs["units"]) if name not in ("model", "answer")]
+    begins = rows.drop_duplicates("unit").set_index("unit")[list(dict.fromkeys(names))].astype(str)
+    values = begins.agg(" ".join, axis=1)
+    return [f"values {values[unit]}" for unit in rows["unit"]]
+
+
+def picture_names(sweep: AskedSweep, rows: pd.DataFrame) -> list[str]:
+    """Return a name of what each row (n,) of a sweep is: settings, number, values and model, so that equal ones are the
+    same prediction of the same picture."""
+    deciding = {name: value for name, value in sweep.config.deciding().items() if name not in EXTENT}
+    values = rows[[*OUTER, *(name for name in rows.attrs["units"] if name not in OUTER)]].astype(str)
+    texts = values.agg(" ".join, axis=1)
+    named = zip(rows["step"], texts, rows["correct"], strict=True)
+    return [f"{deciding} {step} {text} {correct}" for step, text, correct in named]
 
 
 def values_of(rows: pd.DataFrame, place: int) -> dict[str, float | str]:

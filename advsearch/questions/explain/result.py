@@ -30,13 +30,17 @@ class RightOf(Fields):
     right: int = Field(description="right predictions")
     total: int = Field(alias="of", description="how many")
     interval: Interval = Field(description="of the share, 95 %")
+    share: float | None = Field(
+        default=None,
+        description="right ones of all; where rows share draws, the mean over draws of the share of each",
+    )
     outcomes: Outcomes = optional(f"{WHAT_BECOMES} in the other ones; {ONLY_OF_BOXES}")
 
     @property
     def text(self) -> str:
         """A share with its interval and what it is of: ``12 % (9 to 16) of 340``; of a detector, what the others are:
         ``... of 340 (250 missed, 49 loose)``."""
-        share = share_of_text(self.right, self.total, self.interval)
+        share = share_of_text(self.right, self.total, self.interval, self.share)
         outcomes = wording.outcomes_text(self.outcomes)
         return f"{share} ({outcomes})" if outcomes else share
 
@@ -184,7 +188,7 @@ def shown(result: ExplainResult) -> ShownResult:
         ResultPart.table(result.importance[:MOST_WEIGHTS], weights, title="What decides", note=DECIDES),
         ResultPart("Where it can be relied on", [envelope_text(result)]),
     ]
-    if result.pairs_sought and result.renders:  # older runs count failures for which nothing could be rendered
+    if result.pairs_sought:
         sections.append(ResultPart("One thing changed", [pairs_text(result)]))
     for pair in result.pairs:
         unit = f" {pair.unit}" if pair.unit not in ("", "1") else ""
@@ -268,12 +272,12 @@ def claims(result: ExplainResult) -> Iterator[Claim]:
     for number, rule in enumerate(result.rules, 1):
         how = "fresh renders" if rule.confirmed else "rows that did not choose the rule"
         of = rule.confirmed or rule
-        extent = counted(f"right, of {how}", of.right, of.total, of.interval)
+        extent = counted(f"right, of {how}", of.right, of.total, of.interval, of.share)
         text = f"Where {conditions_text(rule.conditions)} (rule {number}) the model is right in {share_text(extent)}"
         yield claim("measured", f"{text} {how}; elsewhere in {rule.elsewhere.text}.", extent)
     box = result.envelope
     if box is not None and box.held and box.total:
-        extent = counted("right, of rows that did not choose the box", box.right, box.total, box.interval)
+        extent = counted("right, of rows that did not choose the box", box.right, box.total, box.interval, box.share)
         text = f"Inside {conditions_text(box.conditions)} the model is right in {share_text(extent)} configurations"
         yield claim("measured", f"{text} that did not choose this box; the sweeps drew no others.", extent)
     elif not result.rules:

@@ -13,8 +13,6 @@ from typing import Any
 
 from advsearch import seeds
 from advsearch.api.keywords import asks, configured
-from advsearch.attacks import clopper_pearson
-from advsearch.attacks.trials import mcnemar
 from advsearch.engine.journal import check_made_of
 from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
 from advsearch.engine.record import Stages
@@ -34,6 +32,8 @@ from advsearch.registry import get_experiment
 from advsearch.runs.directory import ARTIFACTS, RunDirectory, is_run, run_path
 from advsearch.runs.results import SharedWork
 from advsearch.runs.store import Row
+from advsearch.statistics.clustered import share_interval
+from advsearch.statistics.paired import mcnemar
 from advsearch.tasks import make_task
 
 MEANS = "means"  # the note of what a training has from Python
@@ -239,8 +239,8 @@ class Hardening:
         return asked.result(
             HardenResult, **paired, environment=",".join(taught.environments), objects=list(taught.objects),
             before=_share(before), after=_share(after),
-            clean_before=_share(self.clean.get("before"), self.outcomes.get("before")),
-            clean_after=_share(self.clean.get("after"), self.outcomes.get("after")),
+            clean_before=_share(self.clean.get("before"), scenes.CLEAN_VIEWS, self.outcomes.get("before")),
+            clean_after=_share(self.clean.get("after"), scenes.CLEAN_VIEWS, self.outcomes.get("after")),
             table=table, split=split, rounds=rounds,
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search=f"portfolio of pgd with restarts, cmaes and random, {scenes.TIMES * config.steps} steps",
@@ -253,9 +253,13 @@ class Hardening:
         )  # fmt: skip
 
 
-def _share(right: Sequence[bool] | None, outcomes: Mapping[str, int] | None = None) -> Share | None:
+def _share(right: Sequence[bool] | None, views: int = 1, outcomes: Mapping[str, int] | None = None) -> Share | None:
+    """Return the share of pictures that are right, so many `views` of each scene, one after the other, with its
+    interval over scenes: views of one scene are not independent."""
     if right is None:
         return None
-    total, count = sum(right), len(right)
-    interval, counts = clopper_pearson(total, count), dict(outcomes or {}) or None
-    return Share(accuracy=total / count, interval=interval, right=total, count=count, outcomes=counts)
+    right_views = [sum(right[first : first + views]) for first in range(0, len(right), views)]
+    interval = share_interval(right_views, [views] * len(right_views))
+    accuracy = sum(right) / len(right)
+    counts = dict(outcomes or {}) or None
+    return Share(accuracy=accuracy, interval=interval, right=sum(right), count=len(right), outcomes=counts)

@@ -21,18 +21,19 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from advsearch import seeds
 from advsearch.engine.problem import Problem
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.files import parse_json, read_text
 from advsearch.models import Model
 from advsearch.models.reference import Trainable
 from advsearch.pictures import upright
 from advsearch.questions.attack.carry_out import attack_on, problem_of
 from advsearch.questions.harden.rounds import Course, MakeOptimiser, Score, Take
 from advsearch.questions.harden.scenes import SceneWork
-from advsearch.runs.files import write_bytes, write_png
+from advsearch.runs.files import write_png
 from advsearch.scene.formation import levels_of
 from advsearch.tasks import Task, make_task
 from advsearch.tasks.boxes import Place
 from advsearch.tasks.segmentation import Region, Segmentation
+from advsearch.trust.stored_files import parse_json, read_text
+from advsearch.trust.writing import write_bytes
 
 Target = dict[str, Tensor]
 """What is in a picture: "boxes" (K, 4), x0, y0, x1, y1 in pixels of the network's input, and "labels" (K,) indices."""

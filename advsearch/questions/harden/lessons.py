@@ -27,10 +27,11 @@ from advsearch.attacks import Domain
 from advsearch.controls import Space
 from advsearch.engine.problem import Problem
 from advsearch.models import Model
-from advsearch.runs.files import replacing, write_png
+from advsearch.runs.files import write_png
 from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.transport.lights import why_not
 from advsearch.scene.transport.matrix import LinearRenderer
+from advsearch.trust.writing import replacing
 
 SPP, MATRIX_SPP, DEPTH = 2, 4, 4
 """Samples a pixel of a lesson's pictures, and of a matrix of light transport; segments of the longest path: many

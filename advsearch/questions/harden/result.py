@@ -57,7 +57,7 @@ class HardenConfig(AttackConfig):
     without: ClassVar[tuple[str, ...]] = (
         "smallest", "ensemble", "printable", "aov", "metrics", "log", "target", "minimise", "over", "draws", "path",
         "shutter", "rolling",
-        "average", "baseline", "seconds", "camera", "up", "size", "unit", "label", "measure", "estimators",
+        "average", "baseline", "seconds", "camera", "up", "facing", "size", "unit", "label", "measure", "estimators",
         "things", "judge",
     )
 
@@ -133,7 +133,7 @@ class Share(Fields):
     """A share of right predictions."""
 
     accuracy: float = Field(description="`right` of `count`")
-    interval: Interval
+    interval: Interval = Field(description="of that share, 95 %, over scenes of the objects at hand")
     right: int
     count: int
     outcomes: Outcomes = optional(f"of plain pictures, {WHAT_BECOMES} in the other ones; {ONLY_OF_BOXES}")
@@ -144,9 +144,7 @@ class HardenedControl(Fields):
 
     control: str
     before: Share
-    stronger_before: Share | None = Field(
-        default=None, description="before, against the search `stronger_search`; absent from runs of older versions"
-    )
+    stronger_before: Share = Field(description="before, against the search `stronger_search`")
     after: Share
     stronger: Share = Field(description="after, against the search `stronger_search`")
 
@@ -186,11 +184,14 @@ class HardenResult(InNotebook, RunResult):
     clean_before: Share | None = Field(description="plain renders of held-out scenes that are right")
     clean_after: Share | None
     gained: int | None = Field(
-        default=None, description="held-out scenes that are robust after and were not before; absent of older runs"
+        default=None,
+        description="held-out scenes that are robust after and were not before; null if it was interrupted",
     )
     lost: int | None = Field(default=None, description="held-out scenes that were robust before and are not after")
     p: float | None = Field(
-        default=None, description="how likely it is by chance that one is so much larger: McNemar's exact test"
+        default=None,
+        description="how likely it is by chance that one is so much larger, in further scenes of the same objects: "
+        "McNemar's exact test over scenes. Of other objects it says nothing",
     )
     table: list[HardenedControl]
     search: str = Field(description="policy and steps of the searches of `before` and `after`")
@@ -213,8 +214,9 @@ class HardenResult(InNotebook, RunResult):
 
 
 ROBUST = (
-    "Robust: the plain picture of a held-out scene is right, and the search finds no wrong one. 95 % Clopper-Pearson "
-    "intervals over scenes."
+    "Robust: the plain picture of a held-out scene is right, and the search finds no wrong one. 95 % intervals over "
+    "scenes: Clopper-Pearson; of plain pictures, two of each scene, by bets. Scenes are of the objects that are named: "
+    "intervals and p say nothing of other objects."
 )
 TRAINED = (
     "Round 0 is the model as it was. Weights are part of the way from those to the trained ones. Judged on scenes in "
@@ -282,7 +284,8 @@ def shown(result: HardenResult) -> ShownResult:
             others = wording.outcomes_text(share.outcomes, result.task)
             said += f" {when}, the other plain pictures are {others}." if others else ""
         if result.lost is not None:
-            said += f" Scene by scene: {result.gained} got better, {result.lost} worse (p = {result.p:.2g})."
+            said += f" Scene by scene: {result.gained} got better, {result.lost} worse (p = {result.p:.2g}, "
+            said += "for scenes of these objects; of other objects it says nothing)."
     chart: dict[str, Any] = {"draw": draw, "size": (6.4, 1.4 + 0.45 * len(shares))} if shares else {}
     sections = [
         ResultPart("Before and after", heads=HEADS, rows=measured, note=ROBUST, height=110 + 44 * len(shares), **chart),

@@ -24,7 +24,7 @@ from advsearch.questions.harden.result import TrainingRound
 from advsearch.questions.harden.scenes import TRAINING, VALIDATION, SceneWork
 from advsearch.report.wording import percent
 from advsearch.runs.directory import ARTIFACTS, RunDirectory
-from advsearch.runs.files import write_bytes
+from advsearch.trust.writing import write_bytes
 
 WEIGHTS, ROUND, PICTURES = "hardened.safetensors", "round-{:03d}.safetensors", "pictures"
 """In `artifacts/`: the weights that are kept, those after each round, and what they were trained on."""

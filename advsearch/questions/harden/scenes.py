@@ -18,7 +18,7 @@ from advsearch import seeds
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.bundled.changed_light import varied, white_light_changed
 from advsearch.bundled.objects import OBJECTS
-from advsearch.cluster import Call, Executor, InProcess
+from advsearch.cluster import Call, InProcess, Workers
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import RUN_SETTINGS, load_models, scene_settings, settings_alone
 from advsearch.engine.problem import Problem
@@ -73,7 +73,7 @@ class SceneWork:
     model: Model
     splits: Mapping[str, SceneSide]
     progress: Progress = field(default_factory=NullProgress)
-    executor: Executor | None = None
+    executor: Workers | None = None
 
     def __call__(self, wanted: Iterable[Wanted]) -> list[Any]:
         return [each(self) for each in wanted]

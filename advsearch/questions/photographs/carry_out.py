@@ -17,14 +17,13 @@ from PIL import Image
 from pydantic import JsonValue
 
 from advsearch import seeds
-from advsearch.attacks import clopper_pearson
 from advsearch.calls import helped
 from advsearch.engine.judging import judgements
 from advsearch.engine.naming import in_turn
 from advsearch.engine.record import judged
 from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import JsonObject, read_bytes
+from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import Value
 from advsearch.questions.attack.carry_out import judged_alone, problem_from_config
@@ -34,12 +33,14 @@ from advsearch.questions.photographs.result import LOOSE_PHOTO, PHOTO, PhotoAgre
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
-from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.settings import read_yaml
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import AnyTask, Judgement, Task, make_task
 from advsearch.tasks.base import Truth
 from advsearch.tasks.together import Together
+from advsearch.trust.stored_files import read_bytes
+from advsearch.trust.writing import write_bytes
 from advsearch.viewer.clients import LARGEST_SENT
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")  # of the files in a folder that are photographs

@@ -29,7 +29,8 @@ from advsearch.report.shown import Html, element, join_html
 from advsearch.report.wording import percent
 from advsearch.runs.directory import IMAGES
 from advsearch.runs.results import Fields, Interval
-from advsearch.viewer.clients import LARGEST_SENT, NO_QR, Refused, qr_code
+from advsearch.trust.pages import Refused
+from advsearch.viewer.clients import LARGEST_SENT, NO_QR, qr_code
 from advsearch.viewer.document import data_script, document, in_address, study_table
 from advsearch.viewer.thumbnails import kept_file, kept_pictures
 

@@ -27,10 +27,10 @@ from advsearch.questions.precision import result as room
 from advsearch.questions.precision.benches import OIDN, GradientBench, GradientPart, PictureBench, TimeBudget
 from advsearch.questions.precision.result import PrecisionConfig, PrecisionPoint, PrecisionResult, Recommended, Sitting
 from advsearch.questions.precision.rule import RoundUp, confirmed, fit_line, point_of, reaching, warning_of
-from advsearch.runs.files import write_bytes
 from advsearch.runs.results import Formation
 from advsearch.scene.formation import next_count
 from advsearch.settings import split_names
+from advsearch.trust.writing import write_bytes
 
 SHARES = {"image": 0.6, "gradient": 0.4}  # of the time, by quantity; what one doesn't use is the others'
 REFERENCE_SHARE = 0.35  # of the time of a quantity, for its reference

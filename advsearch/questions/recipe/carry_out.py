@@ -33,13 +33,13 @@ from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report.figures import Figures, drawn
 from advsearch.report.wording import DETECTION
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
-from advsearch.runs.files import write_bytes
 from advsearch.runs.results import INTERRUPTED
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.runs.summary import read_result
 from advsearch.threads import cores
+from advsearch.trust.writing import write_bytes
 
 TURN = 360.0
 NOTE = "recipe"  # under which a run's store keeps the recipe, so that it goes on as it began

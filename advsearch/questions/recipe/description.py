@@ -205,8 +205,20 @@ def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
 def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
     """Return the recipe as it was asked for: quick or not, with the objects, environments and models of `config`."""
     chosen = recipe.made_quick() if config.quick else recipe
-    names = ("object", "environment", "model", "labels", "prompt", "value_range", "task", "up", "size", "unit")
-    names += ("resolution",)
+    names = (
+        "object",
+        "environment",
+        "model",
+        "labels",
+        "prompt",
+        "value_range",
+        "task",
+        "up",
+        "facing",
+        "size",
+        "unit",
+        "resolution",
+    )
     asked = {name: value for name in names if (value := getattr(config, name)) is not None}
     settings: Settings = {**chosen.settings, **asked}
     if "object" not in settings:

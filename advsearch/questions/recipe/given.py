@@ -13,11 +13,11 @@ import numpy.typing as npt
 import pandas as pd
 from pydantic import Field
 
-from advsearch.attacks.trials import CONFIDENCE
 from advsearch.questions.recipe import rates
 from advsearch.questions.recipe.rates import MadeFigure, Options, Rows, Tally
 from advsearch.report.figures import BLUE, GREY, RED
 from advsearch.report.wording import percent
+from advsearch.statistics.intervals import CONFIDENCE
 
 LETTERS, FEWEST_LETTERS = 85, 4  # letters that a bar of the whole width has room for, and of a name that is cut short
 

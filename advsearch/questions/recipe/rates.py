@@ -17,7 +17,6 @@ import pandas as pd
 from pandas.api.types import is_numeric_dtype
 from pydantic import BaseModel, ConfigDict, Field
 
-from advsearch.attacks.trials import CONFIDENCE, per_unit, share_interval
 from advsearch.errors import InputError
 from advsearch.options import OUT_OF_VIEW
 from advsearch.questions.attack.summary import AttackSummary
@@ -30,6 +29,8 @@ from advsearch.runs.directory import IMAGES, PARTS
 from advsearch.runs.results import Interval
 from advsearch.runs.store import NAME, Store
 from advsearch.runs.tables import units_of
+from advsearch.statistics.clustered import mean_share, per_unit, share_interval
+from advsearch.statistics.intervals import CONFIDENCE
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The rows of a recipe's runs as one frame, and what all figures make of it: counts, sentences, a picture.
@@ -57,11 +58,10 @@ def read_rows(
     (`object`, `environment`, `model`, and parameters), what was said of it (`answer`, `correct`, `margin`), the `time`
     when it was stored, seconds since 1970, and the `unit` of what it shares with rows that are not independent of it:
     draws of one seed are the same ones, also in another part."""
-    rows, units, drawn, alike = list[dict[str, Any]](), dict[str, str](), None, 1
+    rows, units, drawn = list[dict[str, Any]](), dict[str, str](), None
     with Store(folder / NAME, read_only=True) as store:
         if isinstance(summary, SweepSummary):
-            # without draws, samples of a point differ by noise alone
-            drawn, alike = units_of(store), 1 if summary.sampler is not None else summary.samples
+            drawn = units_of(store, is_drawn=summary.sampler is not None)
         for row in store.rows():
             if row.kind not in kinds or (row.kind == "sweep" and row.label == OUT_OF_VIEW):
                 continue
@@ -69,7 +69,7 @@ def read_rows(
             units |= {name: about["unit"] for name, about in row.values.items()}
             unit = f"{folder.name} {row.kind} {row.id}"
             if row.kind == "sweep" and drawn is not None:
-                unit = f"{seed} {drawn.of(row.step) // alike}"
+                unit = f"{seed} {drawn.of(row.step)}"
             if isinstance(summary, AttackSummary):
                 values[TRIAL], unit = TRIALS[row.kind], f"{seed} {row.step}"
             for name in ("object", "environment", MODEL):
@@ -123,12 +123,12 @@ def most_frequent(predictions: Iterable[str]) -> list[tuple[str, int]]:
 
 class Tally:
     """How many of some rows are counted: of each independent unit, such as a drive, `counted` (n,) of its `of` (n,);
-    in all `times` of `total`, and their share, None where there are no rows."""
+    in all `times` of `total`, and the mean over units of their share, None where there are no rows."""
 
     def __init__(self, name: str, counted: Numbers, of: Numbers) -> None:
         self.name, self.counted, self.of = name, counted, of
         self.times, self.total = round(float(counted.sum())), round(float(of.sum()))
-        self.share = float(counted.sum() / of.sum()) if self.total else None
+        self.share = mean_share(counted, of) if self.total else None
 
     @classmethod
     def over(cls, name: str, rows: Rows, flags: Any = None) -> Tally:

@@ -50,6 +50,7 @@ class RecipeConfig(Config):
         expects="names of environments or .hdr or .exr files",
     )
     up: Literal["y", "z"] | None = setting_as_in(SceneConfig, "up")
+    facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = setting_as_in(SceneConfig, "facing")
     size: float | None = setting_as_in(SceneConfig, "size")
     unit: Literal["mm", "cm", "m", "in"] | None = setting_as_in(SceneConfig, "unit")
     resolution: tuple[int, int] | None = setting_as_in(

@@ -12,7 +12,6 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks.domain import batches
 from advsearch.attacks.evaluation import most_at_once
-from advsearch.attacks.trials import clopper_pearson
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Stages
@@ -28,12 +27,13 @@ from advsearch.questions.region.result import AxisRange, BoxSide, GrownRegion, M
 from advsearch.questions.sweep.predicting import pays_from
 from advsearch.report.figures import MARGIN, axis_title, figure_of, heat
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
-from advsearch.runs.files import write_bytes
 from advsearch.runs.summary import read_configuration
 from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.surface import renderer as surface_renderer
 from advsearch.scene.surface.arrangement import CAMERAS, FREE
 from advsearch.settings import split_names
+from advsearch.statistics.intervals import clopper_pearson
+from advsearch.trust.writing import write_bytes
 
 MOST = 8  # A box is grown in at most so many parameters
 AT_CENTRE = 20  # Trials of the centre

@@ -13,10 +13,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from advsearch import __version__, registry
-from advsearch.attacks import clopper_pearson
 from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
-from advsearch.files import read_bytes
 from advsearch.questions.attack import wording as attack_wording
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.explain.result import ExplainResult, rule_text
@@ -47,6 +45,8 @@ from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.runs.summary import read_result
 from advsearch.scene.description import NO_MAP
 from advsearch.settings import read_yaml
+from advsearch.statistics.intervals import clopper_pearson
+from advsearch.trust.stored_files import read_bytes
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What an engineer reads of a run beside its claims: shares by condition, whether a criterion is met, how common
@@ -72,7 +72,8 @@ def conditions_of(result: Result, photographs: Sequence[Row] | None = None) -> l
     agree with the rendering that they were aligned with: right in both or wrong in both."""
     conditions = []
     for row in result.axes if isinstance(result, SweepSummary) else ():
-        right, total, interval = row.correct, row.configurations, row.interval
+        right, total = row.correct, row.configurations
+        interval: tuple[float, float] | None = row.interval or (0.0, 1.0)  # none of one draw
         if photographs is not None:
             agree = [
                 bool(photo.correct) == bool(cast(Any, photo.payload)["photo"]["right"])
@@ -287,7 +288,7 @@ def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
     return warnings
 
 
-NOT_NOTED = "not noted: the run is older than that"
+NOT_NOTED = "not noted"
 NO_CLAIM = "The run carries no claim; it is listed so that it is not left out unseen."
 WEIGHTED = "How common the conditions are is what the weights say, of their axes alone."
 NOT_WEIGHTED = "Nothing is said of how common the conditions are: no weights were given."
@@ -297,7 +298,7 @@ def evidence_of(
     name: str, result: Result, claims: Sequence[Claim], recorded: Sequence[RecordedSettings], made: Mapping[str, str]
 ) -> EvidenceRun:
     """Return a run with what a reader needs to judge its claims: the settings that it recorded, its own first, and
-    versions and digests as it noted them (empty of older runs)."""
+    versions and digests as it noted them."""
     settings = recorded[0].values if recorded else {}
     values = {field: getattr(result, field) for field in type(result).model_fields}
     objects = values.get("object") or ", ".join(values.get("objects") or ())

@@ -8,7 +8,7 @@ from advsearch.questions.stability.result import StabilityConfig, StabilityResul
 
 @experiment(
     "stability",
-    "stability --group objective --group stiff",
+    "stability --group geometry --group stiff",
     "stability --case hdri-texel-100000 --json",
     "stability --seconds 120 --run extremes",
     "resume extremes",

@@ -200,7 +200,7 @@ def on_grid(controls: Sequence[Control], axes: Sequence[Axis], scene: SceneDescr
 # ---------------------------------------------------------------------------------------------------------------------
 # From the number of a picture to its configuration and what is stored of it: arithmetic, nothing is kept. Every
 # picture has a draw of its own, so that pictures are independent; only pairs without and with an adversarial scene have
-# the same ones.
+# the same ones, frames of a drive, and samples of a point where nothing is drawn (`runs.tables.Units`).
 
 MOST_PARTS, FEWEST_PARTS = 10, 2
 LEAST_IN_A_CELL = 5
@@ -267,7 +267,6 @@ class Points:
         self.samples, self.count = samples, self.grid.count * samples
         self.parts = parts_of_ranges(self.count * among)
         frames = next((place for place, axis in enumerate(axes) if axis.is_time), None)
-        self.units = Units(self.grid.sizes, frames, samples, again=scenes * self.count)
         self.space = space
         self._start = domain.start.numpy().astype(np.float64)
         self._lower, self._upper = domain.lower.numpy(), domain.upper.numpy()
@@ -293,6 +292,8 @@ class Points:
         self._draws = Draws(dimensions[0], sampler, seed)
         self._chances = (self._draws, small), (Draws(dimensions[1], "random", seed, "large draws"), large)
         self.draws = sum(dimensions) > 0  # whether anything is: controls may have all from the grid, as a path its time
+        draws, noise = (samples, 1) if self.draws else (1, samples)
+        self.units = Units(self.grid.sizes, frames, draws, again=scenes * self.count, noise=noise)
         self.drawn_numbers = (dimensions[0], tuple((number.name, number.column, len(number.parts)) for number in drawn))
         self._described: dict[tuple[object, ...], Mapping[str, Value]] = {}
 

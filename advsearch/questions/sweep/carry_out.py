@@ -45,7 +45,7 @@ from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
 from advsearch.tasks.together import each_thing
 
 OUTER = ("object", "environment")
-OF_A_SCENE = ("object", "environment", "up", "size", "unit", "camera", "things", "set_", "exposure")
+OF_A_SCENE = ("object", "environment", "up", "facing", "size", "unit", "camera", "things", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
 WORKER = "advsearch.questions.sweep.carry_out:sweep_worker"  # what a worker does
 CLEAN = "clean"  # what the scene without the adversarial configuration of a run is called beside that with it

@@ -14,7 +14,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from advsearch.errors import InputError
 from advsearch.options import Outcome
@@ -35,6 +34,7 @@ from advsearch.report.shown import Claim, Column, Extent, ResultPart, ShownResul
 from advsearch.report.wording import beside_text, count, margin_text, percent, prediction_text, short_name
 from advsearch.runs.results import INTERRUPTED
 from advsearch.settings import split_names
+from advsearch.statistics.monotone import Dip, _fit_falling, find_dips
 
 # ---- The figure of a sweep: a map over two axes, or the accuracy over the only one ----------------------------------
 
@@ -95,8 +95,9 @@ def _cells(axes: Any, summary: SweepSummary, cells: SweepMap) -> None:
 
 def _along(axes: Any, summary: SweepSummary, rows: Sequence[AxisRow]) -> None:
     at, accuracy = range(len(rows)), [row.accuracy for row in rows]
-    low, high = ([row.interval[end] for row in rows if row.interval] for end in (0, 1))
-    axes.vlines(at, low, high, color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
+    intervals = [(place, *row.interval) for place, row in enumerate(rows) if row.interval]  # of one draw there is none
+    if intervals:
+        axes.vlines(*zip(*intervals, strict=True), color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
     axes.plot(at, accuracy, "o", color=BLUE, label="accuracy")
     axes.set_xticks(*_ticks([row.value for row in rows]), rotation=45 if _long([r.value for r in rows]) else 0)
     axes.set(xlabel=axis_title(rows[0].axis, rows[0].unit), ylabel="accuracy", ylim=(-0.03, 1.03))
@@ -284,7 +285,7 @@ def _table(name: str, rows: Sequence[AxisRow], task: str) -> ResultPart:
 
 def claims(result: SweepSummary) -> Iterator[Claim]:
     """Yield the share of right predictions, and how often the worst of the configurations is wrong."""
-    if result.accuracy is None or result.interval is None or result.ending != "finished":
+    if result.accuracy is None or result.ending != "finished":
         return
     thing = f"frames of {result.drives[0].drives} drives" if result.drives else "configurations"
     how, note = f"{thing} drawn by chance from the ranges that are named", ""
@@ -340,7 +341,7 @@ def claims(result: SweepSummary) -> Iterator[Claim]:
 
 
 def _extent(what: str, counts: CountedPredictions) -> Extent:
-    return counted(what, counts.correct, counts.configurations, counts.interval)
+    return counted(what, counts.correct, counts.configurations, counts.interval, counts.accuracy)
 
 
 DRIVE_HEADS = ("", "mean", "95 % interval", "worst drive")  # what stands above the rows
@@ -353,7 +354,8 @@ def rate_text(summary: SweepSummary) -> str:
 
 
 def drive_title(one: DriveRates) -> str:
-    what = f"{count(one.drives, 'drive')} of {one.frames} frames in {one.seconds:g} s, {one.model}"
+    repeats = f", {one.repeats} times each with other noise" if one.repeats > 1 else ""
+    what = f"{count(one.drives, 'drive')} of {one.frames} frames in {one.seconds:g} s{repeats}, {one.model}"
     return what if one.answer is None else f"{what}, with {one.answer}"
 
 
@@ -404,33 +406,6 @@ def wrong_text(counted: CountedPredictions) -> str:
 
 DISTANCE = "camera.distance"  # the axis
 HALF = 0.5
-FALSE_ALARMS = 0.05
-"""Share of falling curves of which a dip is reported, at most."""
-
-
-@dataclass(frozen=True)
-class Dip:
-    """A distance at which an object is seen less often than beyond it.
-
-    Attributes:
-        distance: the nearer one.
-        seen: pictures that are right there, and how many there are.
-        until: the farthest of the distances beyond it that are compared with it.
-        beyond: pictures that are right at these, and how many there are.
-        p: how likely so large a difference is where the share falls with the distance; of all differences that were
-            looked at together.
-    """
-
-    distance: float
-    seen: tuple[int, int]
-    until: float
-    beyond: tuple[int, int]
-    p: float
-
-    @property
-    def is_shown(self) -> bool:
-        """Whether chance is no explanation."""
-        return self.p <= FALSE_ALARMS
 
 
 @dataclass(frozen=True)
@@ -477,7 +452,8 @@ def distance_of(summary: SweepSummary) -> SeenFrom | None:
     """Return how far away one model sees one object; None where the sweep does not tell."""
     rows = [row for row in summary.axes if row.axis == DISTANCE and row.configurations]
     several = "," in summary.object or "," in summary.model or summary.beside is not None
-    several = several or summary.drives is not None  # frames of a drive are not independent
+    # frames of a drive are not independent, nor are samples of a point where nothing is drawn
+    several = several or summary.drives is not None or summary.units is not None
     known = summary.task.partition("=")[0] == "detection" and len(rows) > 1 and not several
     return seen_from(rows) if known else None
 
@@ -515,51 +491,6 @@ def seen_from(rows: Sequence[AxisRow]) -> SeenFrom:
         dips=dips,
         everywhere=bool(falling[-1] >= HALF),
     )
-
-
-def _fit_falling(right: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Fit shares (m,) that do not rise, by isotonic regression."""
-    from scipy.optimize import isotonic_regression  # takes a quarter of a second
-
-    fitted: NDArray[np.float64] = isotonic_regression(right / counts, weights=counts, increasing=False).x
-    return fitted
-
-
-def find_dips(distances: Sequence[float], right: NDArray[np.int64], counts: NDArray[np.int64]) -> tuple[Dip, ...]:
-    """Find distances, the nearest first, at which an object is seen less often than beyond them.
-
-    Each distance is compared with each run of distances right behind it by Fisher's exact test (one-sided), and the
-    p-values are multiplied by how many comparisons there are (Bonferroni). Where the shares fall, those beyond are
-    at most the nearer one, which makes large differences only rarer: so one falling curve in twenty has a dip that is
-    shown, at most (`benchmarks/first_seen.py --simulated`). Listed are those that are shown, and those that bring the
-    estimate's line below the shares beyond, which may be chance.
-    """
-    from scipy.stats import hypergeom  # takes half a second
-
-    n_distances = len(distances)
-    comparisons = n_distances * (n_distances - 1) / 2.0
-    right_before, counts_before = (np.concatenate([[0], np.cumsum(column)]) for column in (right, counts))
-    dips = []
-    for near in range(n_distances - 1):
-        far = np.arange(near + 2, n_distances + 1)
-        right_beyond = right_before[far] - right_before[near + 1]
-        counts_beyond = counts_before[far] - counts_before[near + 1]
-        total_right, total = right_beyond + right[near], counts_beyond + counts[near]
-        p = hypergeom.cdf(right[near], total, total_right, counts[near])
-        lower = right[near] / counts[near] < right_beyond / counts_beyond
-        if not lower.any():
-            continue
-        best = int(np.argmin(np.where(lower, p, np.inf)))
-        dips.append(
-            Dip(
-                distance=float(distances[near]),
-                seen=(int(right[near]), int(counts[near])),
-                until=float(distances[near + 1 + best]),
-                beyond=(int(right_beyond[best]), int(counts_beyond[best])),
-                p=min(1.0, float(p[best]) * comparisons),
-            )
-        )
-    return tuple(dips)
 
 
 def distance_sentence(found: SeenFrom) -> str:

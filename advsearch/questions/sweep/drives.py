@@ -1,16 +1,18 @@
 """Drives: what a sweep over the frames of a path says of whole drives, everything that varies but the time, and the
 worst of them. Frames are not independent, so intervals are over drives, and hold for any number of them: each number
-has ends that it cannot pass (`attacks.trials`)."""
+has ends that it cannot pass, known from the plan (`attacks.trials`). Where nothing is drawn, samples of a drive differ
+in noise alone: they are one drive, whose numbers are the means of theirs."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
-from advsearch.attacks.trials import mean_interval
 from advsearch.controls import Control
 from advsearch.controls.base import WAY
 from advsearch.engine.naming import given_to
@@ -24,6 +26,8 @@ from advsearch.questions.sweep.tracks import DetectedFrame, frame_of, tracked
 from advsearch.report.figures import marked
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
+from advsearch.runs.tables import Units
+from advsearch.statistics.clustered import mean_interval, per_unit
 from advsearch.tasks import Detection
 from advsearch.tasks.boxes import LEAST_OVERLAP
 
@@ -54,13 +58,33 @@ def time_axis(axes: Sequence[Axis]) -> int | None:
     return next((place for place, axis in enumerate(axes) if axis.is_time and len(axis.values) > 1), None)
 
 
+def planned_distances(job: Job, axis: Axis) -> tuple[float, float] | None:
+    """Return the nearest and the farthest distance, as rows say it, that any drive of a sweep can have at the times of
+    an axis: on each of the paths, also one that was not drawn, and in each scene. None of a path that says none."""
+    times = torch.tensor([float(value) for value in axis.values])
+    lowest, highest = math.inf, -math.inf
+    for scene in range(len(job.places)):
+        for points in job.bound(scene).values():
+            control: Any = next((one for one in points.space.controls if one.name == axis.instance), None)
+            if control is None or not control.travels:
+                return None
+            distances = control.distances(times)
+            lowest, highest = min(lowest, float(distances.min())), max(highest, float(distances.max()))
+    return lowest, highest
+
+
 class Drives:
     """The frames of every drive of a sweep."""
+
+    _units = Units()
+    _distances: tuple[float, float] | None = None  # from the plan: the ends of a sample are no ends of what it is from
 
     def __init__(self, job: Job, rows: Iterable[Row]) -> None:
         place = time_axis(job.axes)
         assert place is not None
         self._job, axis = job, job.axes[place]
+        self._units = next(iter(job.bound(0).values())).units
+        self._distances = planned_distances(job, axis)
         shape = (len(job.places), *(len(one.values) for one in job.axes), job.samples, len(job.models))
         right: Flags = np.full(shape, UNKNOWN, np.int8)
         away = np.full(shape[:-1], np.nan)
@@ -118,21 +142,23 @@ class Drives:
                 first, gaps = at_first[seen], np.array([longest(drive) for drive in flags == 0]) * step
                 together = shown[:, 1:] & shown[:, :-1]
                 changes = ((right[:, 1:] != right[:, :-1]) & together).sum(axis=1) / seconds
-                ends = float(away.min()), float(away.max())
-                known = len(first) > 0 and bool(np.isfinite(ends).all())
+                drive = np.asarray(self._units.draw(numbers[:, 0] // len(self._job.models)))
+                n_drives = len(np.unique(drive))
+                known = len(first) > 0 and bool(np.isfinite(first).all())
                 drives = DriveRates(
                     model=network.name,
                     answer=beside_clean or None,
-                    drives=len(right),
+                    drives=n_drives,
+                    repeats=-(-len(right) // n_drives),
                     frames=frames,
                     seconds=seconds,
-                    right=over_drives(share, worst=min),
-                    longest_gap=over_drives(gaps, max, (0.0, frames * step)),
-                    first_seen=over_drives(first, min, ends) if known else None,
+                    right=over_drives(share, min, drive=drive),
+                    longest_gap=over_drives(gaps, max, (0.0, frames * step), drive),
+                    first_seen=over_drives(first, min, self._distances, drive[seen]) if known else None,
                     unit=self._unit,
-                    never_seen=int((~seen).sum()),
-                    flicker=over_drives(changes, max, (0.0, (frames - 1) / seconds)),
-                    tracks=self._tracks(model, numbers),
+                    never_seen=n_drives - len(np.unique(drive[seen])),
+                    flicker=over_drives(changes, max, (0.0, (frames - 1) / seconds), drive),
+                    tracks=self._tracks(model, numbers, drive),
                     each=[
                         OneDrive(
                             row=begin,
@@ -148,8 +174,9 @@ class Drives:
                 rates.append(drives)
         return rates
 
-    def _tracks(self, model: int, numbers: npt.NDArray[np.int64]) -> TrackRates | None:
-        """What a tracker makes of drives, by the numbers (n, frames) of their rows; None without boxes in all."""
+    def _tracks(self, model: int, numbers: npt.NDArray[np.int64], drive: npt.NDArray[np.int64]) -> TrackRates | None:
+        """What a tracker makes of drives, by the numbers (n, frames) of their rows and of the `drive` (n,) that these
+        are of; None without boxes in all."""
         task, frames, tracker = self._job.tasks[model], len(self.times), self._job.tracker
         if not isinstance(task, Detection) or not all(number in self._frames for number in numbers.flat):
             return None
@@ -161,10 +188,10 @@ class Drives:
         lost, switches, gaps = (np.array(values, dtype=float) for values in zip(*drives, strict=True))
         return TrackRates(
             tracker=str(getattr(tracker, "__name__", type(tracker).__name__)),
-            lost=over_drives(lost, max),
-            loose=over_drives(lost - np.array(loosely), max),
-            switches=over_drives(switches, max, (0.0, frames - 1.0)),
-            longest_gap=over_drives(gaps * step, max, (0.0, frames * step)),
+            lost=over_drives(lost, max, drive=drive),
+            loose=over_drives(lost - np.array(loosely), max, drive=drive),
+            switches=over_drives(switches, max, (0.0, frames - 1.0), drive),
+            longest_gap=over_drives(gaps * step, max, (0.0, frames * step), drive),
         )
 
     def keep_worst(self, scenes: OpenScenes, run: RunDirectory) -> None:
@@ -188,9 +215,15 @@ def longest(flags: npt.NDArray[np.bool_]) -> int:
 
 
 def over_drives(
-    values: npt.NDArray[np.float64], worst: Callable[[list[float]], float], ends: tuple[float, float] = (0.0, 1.0)
+    values: npt.NDArray[np.float64],
+    worst: Callable[[list[float]], float],
+    ends: tuple[float, float] | None = (0.0, 1.0),
+    drive: npt.NDArray[np.int64] | None = None,
 ) -> OverDrives:
-    """Return the mean of a number over drives, its 95 % interval, and that of the worst drive; `ends` are what it is
-    between whatever a model says."""
-    interval = mean_interval(values, *ends) if len(values) > 1 else None
-    return OverDrives(mean=float(values.mean()), interval=interval, worst=worst(values.tolist()))
+    """Return the mean over drives of a number (n,), its 95 % interval, and the worst number. The numbers of one `drive`
+    (n,) differ in noise alone, so that their mean is the drive's; None: each number is of a drive of its own. `ends`
+    are what a number is between whatever a model says, from the plan; where these are not known, and of one drive,
+    there is no interval."""
+    means = values if drive is None else per_unit(values, drive) / per_unit(np.ones(len(values)), drive)
+    interval = mean_interval(means, *ends) if ends is not None and len(means) > 1 else None
+    return OverDrives(mean=float(means.mean()), interval=interval, worst=worst(values.tolist()))

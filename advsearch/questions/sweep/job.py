@@ -338,7 +338,7 @@ class OpenScenes:
     def asked(self, number: int) -> tuple[SweptScene, list[Query]]:
         """The scene of a picture, open, and what its models are asked about it."""
         sent = self.job.queries(range(number, number + 1))
-        return self.named(sent[0][0]), [query for _, _, query in sent]
+        return self.named(str(sent[0][0])), [query for _, _, query in sent]
 
     def picture(self, number: int) -> Tensor:
         """The picture (H, W, 3) as the first model sees it."""

@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.attacks.domain import batches
-from advsearch.attacks.trials import most_shown
-from advsearch.cluster import Executor, InProcess
+from advsearch.cluster import InProcess, Workers
 from advsearch.engine.journal import Journal, Sent, Shared, finite, lost, other_numbers, same, worker_call
 from advsearch.engine.loading import framed
 from advsearch.engine.record import LOST, Stages, judgement_of, lost_remarks
@@ -33,13 +32,15 @@ from advsearch.questions.sweep.result import FINISHED, Predictions, SweepResult,
 from advsearch.questions.sweep.settings import BLIND
 from advsearch.questions.sweep.summary import WorstConfiguration, WorstVerified
 from advsearch.questions.sweep.surface import map_surface
-from advsearch.report.wording import count
+from advsearch.report.wording import count, repeats_remark
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
-from advsearch.runs.files import write_bytes, write_layers
+from advsearch.runs.files import write_layers
 from advsearch.runs.results import INTERRUPTED, DescribedValue, Formation, LinearTransport, SharedWork
 from advsearch.runs.store import Row
 from advsearch.runs.tables import EDGES, NOTE
+from advsearch.statistics.clustered import most_shown
 from advsearch.tasks import Judgement
+from advsearch.trust.writing import write_bytes
 from advsearch.viewer import thumbnails
 
 NOT_FINITE = "pictures not finite"  # the note under which the store keeps that there were some
@@ -54,9 +55,7 @@ class Sweep:
     """One sweep, from its first configuration or from where it was stopped: `run` has the rows that are there already,
     and None keeps it in memory. Without an executor all is done here."""
 
-    def __init__(
-        self, job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None
-    ) -> None:
+    def __init__(self, job: Job, run: RunDirectory | None, progress: Progress, executor: Workers | None = None) -> None:
         self.job, self.run, self.stages = job, run, Stages(progress)
         self.stages.begin("setup", "preparing the scenes for rendering")
         self.points, self._shown = check_all(job)
@@ -341,8 +340,12 @@ class Sweep:
         self, predictions: Predictions, checked: WorstVerified | None, changes: Sequence[results.ChangeRates]
     ) -> Iterator[str]:
         yield from (*lost_remarks(self._lost), *self.journal.remarks)
+        if self.units.noise > 1:
+            yield repeats_remark(self.units.name, self.units.noise, self.total // self.units.size)
         few = min((rates.drives for rates in self._drives or ()), default=ENOUGH_DRIVES)
-        if few < ENOUGH_DRIVES:
+        if few == 1 and self.units.noise == 1:
+            yield "One drive says nothing of others: there is no interval over drives."
+        elif 1 < few < ENOUGH_DRIVES:
             yield (
                 f"{count(few, 'drive')} can show little: were the model right in all their frames, the interval of "
                 f"that share would begin at {100 * most_shown(few):.0f} %."

@@ -24,9 +24,9 @@ from advsearch.report.shown import Html, element, join_html
 from advsearch.report.shown import shown as shown_of
 from advsearch.report.wording import beside_text, prediction_text
 from advsearch.runs import directory
-from advsearch.runs.files import check_free_folder, placed_by, write_bytes, write_text
 from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
+from advsearch.trust.writing import check_free_folder, placed_by, write_bytes, write_text
 from advsearch.viewer.columns import packed, read_columns
 from advsearch.viewer.document import data_script, data_url, document, remarks_html, subject_html
 from advsearch.viewer.pages import end_html, page_of, part_html

@@ -18,7 +18,6 @@ from advsearch.attacks import Query
 from advsearch.attacks.domain import Product
 from advsearch.engine.acceptance import CHECK_SPP, VIEWS, ComparedView, Deviation, compared, view_of
 from advsearch.engine.problem import Problem
-from advsearch.files import scaled
 from advsearch.questions.sweep.axes import Axis, Points
 from advsearch.runs.results import LinearTransport, PredictionError
 from advsearch.scene.assembly import ON_PICTURE
@@ -30,6 +29,7 @@ from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP
 from advsearch.scene.surface.renderer import SurfaceRenderer, varied, why_not_kept
 from advsearch.scene.transport.lights import BasisRenderer, Lights, lighting
 from advsearch.scene.transport.matrix import SPP
+from advsearch.trust.stored_files import scaled
 
 PAYS = 2.0
 """Times the samples that a prediction takes, comparisons included, that a group has to take rendered, for it to pay."""

@@ -15,8 +15,6 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from advsearch.attacks import clopper_pearson
-from advsearch.attacks.trials import paired_by_unit, per_unit, share_interval
 from advsearch.errors import FileFormatError
 from advsearch.options import OUT_OF_VIEW, Outcome, get_outcome
 from advsearch.pictures import LARGEST_FILE, check_pixels, opened
@@ -30,6 +28,8 @@ from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory, default_name
 from advsearch.runs.export import read_threedb
 from advsearch.runs.tables import Units, read_sweep, to_pandas
+from advsearch.statistics.clustered import mean_share, paired_by_unit, per_unit, share_interval
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 
@@ -45,16 +45,31 @@ UNKNOWN_OUTCOME = 255  # in arrays of places among `OUTCOMES`
 def counted_by_unit(
     right: npt.ArrayLike, units: npt.NDArray[np.int64], outcome: npt.NDArray[np.uint8] | None = None
 ) -> CountedPredictions:
-    """Return count, accuracy and its 95 % interval of predictions (n,) that are of some units (n,), and the outcomes
-    (n,) of those that are not right, where they have some."""
+    """Count predictions (n,) that are of some units (n,), with their accuracy and its 95 % interval.
+
+    The accuracy is the mean over units of the share of each. One unit with several predictions has no interval.
+    `outcome` (n,) has places among `OUTCOMES`, where there are some; those of wrong predictions are counted.
+    """
     right = np.asarray(right)
-    of = per_unit(np.ones(len(right)), units)
-    counted = rate(int(right.sum()), len(right), share_interval(per_unit(right, units), of) if len(right) else None)
-    if outcome is None:
-        return counted
-    counts = np.bincount(outcome[right == 0], minlength=len(OUTCOMES))
-    named = {one.value: int(number) for one, number in zip(OUTCOMES, counts, strict=False) if number}
-    return counted.model_copy(update={"outcomes": named or None})
+    if not len(right):
+        return rate(0, 0)
+    right_in_unit = per_unit(right, units)
+    unit_size = per_unit(np.ones(len(right)), units)
+    has_interval = len(unit_size) > 1 or len(right) == 1
+    return CountedPredictions(
+        configurations=len(right),
+        correct=int(right.sum()),
+        accuracy=mean_share(right_in_unit, unit_size),
+        interval=share_interval(right_in_unit, unit_size) if has_interval else None,
+        outcomes=None if outcome is None else _count_outcomes(outcome[right == 0]),
+    )
+
+
+def _count_outcomes(outcome: npt.NDArray[np.uint8]) -> dict[str, int] | None:
+    """Return how often each outcome occurs, by its name; None where none is known."""
+    counts = np.bincount(outcome, minlength=len(OUTCOMES))
+    named = {known.value: int(count) for known, count in zip(OUTCOMES, counts, strict=False) if count}
+    return named or None
 
 
 def rate(correct: int, seen: int, interval: tuple[float, float] | None = None) -> CountedPredictions:

@@ -27,8 +27,11 @@ class CountedPredictions(Fields):
 
     configurations: int = Field(description="how many were looked at")
     correct: int = Field(description="right predictions")
-    accuracy: float | None = Field(description="their share; null where there is no configuration")
-    interval: Interval | None = Field(description="of that share")
+    accuracy: float | None = Field(
+        description="their share; where some share a [draw](drives.md), the mean over draws of the share of each; null "
+        "where there is no configuration"
+    )
+    interval: Interval | None = Field(description="of that share, 95 %; null where all are of one draw")
     outcomes: results.Outcomes = results.optional(f"{results.WHAT_BECOMES} in the other ones; {results.ONLY_OF_BOXES}")
 
 
@@ -154,7 +157,9 @@ class OverDrives(Fields):
     """A number of each drive."""
 
     mean: float = Field(description="over drives")
-    interval: Interval | None = Field(description="of the mean, 95 %, over drives; null of one")
+    interval: Interval | None = Field(
+        description="of the mean, 95 %, over drives; null of one, or where the range is not known beforehand"
+    )
     worst: float = Field(description="of the worst drive")
 
 
@@ -174,9 +179,7 @@ class TrackRates(Fields):
 
     tracker: str = Field(description="its name")
     lost: OverDrives = Field(description="share of the frames that see the object in which no track is on it")
-    loose: OverDrives | None = results.optional(
-        "likewise, in which none fits it, but a loose one is on it; absent of older runs"
-    )
+    loose: OverDrives = Field(description="likewise, in which none fits it, but a loose one is on it")
     switches: OverDrives = Field(description="how often the track on it has another number than before")
     longest_gap: OverDrives = Field(description="seconds of the longest run of frames without its track")
 
@@ -187,12 +190,16 @@ class DriveRates(Fields):
     model: str
     answer: str | None = Field(description="the adversarial scene of a run; null without")
     drives: int = Field(description="how many there are with all their frames")
+    repeats: int = Field(
+        default=1, description="how often each was looked at, with other noise; its numbers are the mean of these"
+    )
     frames: int = Field(description="of each drive")
     seconds: float = Field(description="from the first frame to the last")
     right: OverDrives = Field(description="share of frames in which the model is right")
     longest_gap: OverDrives = Field(description="seconds of the longest run of frames in which it is not")
     first_seen: OverDrives | None = Field(
-        description="distance at the first frame in which it is right, of drives that have one"
+        description="distance at the first frame in which it is right, of drives that have one; `interval` is null "
+        "where the plan does not say between which distances drives are"
     )
     unit: str = Field(default="object sizes", description="of that distance")
     never_seen: int = Field(description="drives without a frame in which it is right")

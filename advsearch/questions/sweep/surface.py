@@ -20,7 +20,6 @@ from scipy.special import xlogy
 
 from advsearch import seeds
 from advsearch.attacks.domain import batches
-from advsearch.attacks.trials import wilson
 from advsearch.engine.loading import framed, load_scene
 from advsearch.engine.record import judgement_of
 from advsearch.options import OUT_OF_VIEW
@@ -31,7 +30,6 @@ from advsearch.questions.sweep.summary import SurfaceMap, SurfacePart, SurfaceTa
 from advsearch.report.figures import drawn
 from advsearch.report.wording import short_name
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.files import write_bytes
 from advsearch.runs.store import Row
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.description import OBJECT
@@ -39,6 +37,8 @@ from advsearch.scene.formation import Surfaces
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.surface_parts import CELLS, SurfaceParts
+from advsearch.statistics.intervals import wilson
+from advsearch.trust.writing import write_bytes
 
 Counts = npt.NDArray[np.int64]
 Doubles = npt.NDArray[np.float64]

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from advsearch.errors import InputError
 from advsearch.experiment import PositionalArgument, RunContext, experiment
-from advsearch.questions.test.result import SuiteResult, claims, junit, markdown, sarif, shown
+from advsearch.questions.test import result as results
+from advsearch.questions.test.result import SuiteResult
 from advsearch.questions.test.settings import Suite, SuiteConfig
 
-FORMATS = {"junit": junit, "sarif": sarif, "markdown": markdown}
+FORMATS = {"junit": results.junit, "sarif": results.sarif, "markdown": results.markdown}
 """Settings that name a file for other programs, and what writes its text from the result."""
 
 
@@ -23,8 +24,8 @@ FORMATS = {"junit": junit, "sarif": sarif, "markdown": markdown}
     about="suite",
     positional=PositionalArgument("SUITE", "a suite, a YAML file"),
     exit_status=lambda result: result.status,
-    view=shown,
-    claims=claims,
+    view=results.shown,
+    claims=results.claims,
 )
 def test(context: RunContext[SuiteConfig], suite: Suite | None = None) -> SuiteResult:
     """Try the claims of a suite, counterexamples first, and write the files for other programs (docs/testing.md).
@@ -33,7 +34,7 @@ def test(context: RunContext[SuiteConfig], suite: Suite | None = None) -> SuiteR
         suite: a YAML file.
     """
     from advsearch.questions.test.carry_out import test_from_config  # imports torch
-    from advsearch.runs.files import write_text
+    from advsearch.trust.writing import write_text
 
     config = context.config
     files = {name: Path(file) for name in FORMATS if (file := getattr(config, name))}

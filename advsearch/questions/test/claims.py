@@ -18,7 +18,6 @@ import advsearch.questions.test.settings as suites
 from advsearch import seeds
 from advsearch.attacks import Evaluation
 from advsearch.attacks.evaluation import Query
-from advsearch.attacks.trials import ConfidenceSequence, clopper_pearson, draws_needed
 from advsearch.config import SceneConfig
 from advsearch.engine.image_changes import AWAY, as_claimed, changed
 from advsearch.engine.journal import Journal, Shared, worker_call
@@ -45,6 +44,8 @@ from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClai
 from advsearch.report.wording import number_text, outcomes_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.settings import split_names
+from advsearch.statistics.intervals import clopper_pearson
+from advsearch.statistics.sequential import ConfidenceSequence, draws_needed
 from advsearch.tasks import Judgement
 
 MANY = 4  # values of a configuration that are said in words, at most

@@ -19,14 +19,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks.trials import clopper_pearson
 from advsearch.attacks.verification import LEAST_RATE, OVER_CONDITIONS
 from advsearch.config import SceneConfig
 from advsearch.engine.loading import Scene
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import kept_configuration
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import parse_json, read_text
 from advsearch.options import OUT_OF_VIEW
 from advsearch.questions.attack.carry_out import parts_in, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
@@ -34,11 +32,14 @@ from advsearch.questions.attack.summary import attack_of
 from advsearch.questions.test.result import FAILED, HELD, UNDECIDED, VERDICTS
 from advsearch.questions.test.settings import Suite
 from advsearch.runs.directory import IMAGES, PARTS, default_name, find_run
-from advsearch.runs.files import read_png, write_bytes, write_text
+from advsearch.runs.files import read_png
 from advsearch.runs.summary import changed_file, file_digests
 from advsearch.settings import FILES, settings
 from advsearch.settings.configuration import PLACE
+from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement
+from advsearch.trust.stored_files import parse_json, read_text
+from advsearch.trust.writing import write_bytes, write_text
 from advsearch.viewer.thumbnails import thumbnail
 
 Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]

@@ -17,7 +17,6 @@ from advsearch.settings import (
     Clash,
     Config,
     each_once,
-    power,
     read_yaml,
     setting,
     setting_as_in,
@@ -26,6 +25,7 @@ from advsearch.settings import (
     texts,
 )
 from advsearch.settings.configuration import PLACE
+from advsearch.trust import powers
 
 
 class SuiteConfig(Config):
@@ -53,10 +53,10 @@ class SuiteConfig(Config):
     )
     add: str | None = setting(
         None, "test", "keep the adversarial scene of this run as a counterexample beside the suite, and try it",
-        "the name or the folder of a run of attack", otherwise="nothing is added", power=power.beside_suite,
+        "the name or the folder of a run of attack", otherwise="nothing is added", power=powers.beside_suite,
     )
     update: bool = setting(
-        False, "test", "expect from now on what the claims say today, and show what changes", power=power.beside_suite
+        False, "test", "expect from now on what the claims say today, and show what changes", power=powers.beside_suite
     )
     all: bool = setting(False, "test", "go on with the other claims where a counterexample fails")
     fresh: bool = setting(False, "test", "draw a new seed, which is told, in place of the suite's")
@@ -66,14 +66,14 @@ class SuiteConfig(Config):
     )
     model: str | None = setting_as_in(SceneConfig, "model", default=None, otherwise="what the suite says, or reference")
     junit: str | None = setting(
-        None, "files", "write JUnit XML, a test case for each claim", "a file", otherwise="none", power=power.file
+        None, "files", "write JUnit XML, a test case for each claim", "a file", otherwise="none", power=powers.file
     )
     sarif: str | None = setting(
         None, "files", "write SARIF 2.1.0, a result for each claim that is not held", "a file",
-        otherwise="none", power=power.file,
+        otherwise="none", power=powers.file,
     )
     markdown: str | None = setting(
-        None, "files", "write a Markdown table, for the summary of a job", "a file", otherwise="none", power=power.file
+        None, "files", "write a Markdown table, for the summary of a job", "a file", otherwise="none", power=powers.file
     )
     seed: int | None = setting_as_in(SceneConfig, "seed", default=None, otherwise="what the suite says, or 0")
     threads: int | None = setting_as_in(SceneConfig, "threads")

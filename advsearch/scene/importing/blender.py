@@ -15,13 +15,14 @@ import sys
 import tempfile
 from pathlib import Path
 
-from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, read_bytes, run_converter, shown
+from advsearch.scene.importing.files import damaged, looks_like, read_bytes, shown
+from advsearch.trust.programs import run_converter, surroundings
+from advsearch.trust.stored_files import LARGEST_FILE, scaled
 
 PROGRAM = "ADVSEARCH_BLENDER"
 """Variable of the environment: a Blender, or a Python that has `bpy`, in the place of those that are looked for."""
-LONGEST = 120  # seconds that Blender may take, before `advsearch.files.scaled`
+LONGEST = 120  # seconds that Blender may take, before `scaled`
 BEGINNINGS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
 """How a .blend file begins: as it is, compressed with zstd, or with gzip (before Blender 3.0)."""
 EXPORT = """
@@ -53,7 +54,7 @@ def convert_blend(path: Path, data: bytes) -> bytes:
     with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
         script, target = Path(folder) / "export.py", Path(folder) / "scene.glb"
         script.write_text(EXPORT, "utf-8")
-        names = [str(path.resolve()), str(target), str(files.scaled(LARGEST_FILE))]
+        names = [str(path.resolve()), str(target), str(scaled(LARGEST_FILE))]
         started = [*program, str(script), *([] if "-I" in program else ["--"]), *names]
         try:
             done = run_converter(path, "Blender", started, folder=folder, seconds=LONGEST, env=surroundings(folder))
@@ -82,12 +83,6 @@ def command(who: str, otherwise: str) -> list[str]:
     if Path(program).name.startswith("python"):
         return [program, "-I"]
     return [program, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1", "--python"]
-
-
-def surroundings(folder: str) -> dict[str, str]:
-    """Return the environment of a process that has a folder for its home, and nothing of ours but the path."""
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
-    return {**kept, "HOME": folder, "TMPDIR": folder}
 
 
 def last_line(said: str) -> str:

@@ -1,30 +1,25 @@
-"""What every importer asks of a file before it is parsed, and of the files that it names: materials, textures, buffers.
-
-A mesh may come from anywhere, so it may name anything. Only ordinary files in its own folder and below are read, after
-links are followed, and not more of them in all than a mesh file itself may have.
-"""
+"""What every importer asks of a file before it is parsed: its kind by ending and beginning, and its size; and what is
+said of it."""
 
 from __future__ import annotations
 
 import difflib
-import errno
 import json
-import os
 import re
 import shlex
-import subprocess
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
 
-from advsearch import files
 from advsearch.errors import FileFormatError
+from advsearch.files import either
+from advsearch.trust import stored_files
+from advsearch.trust.stored_files import LARGEST_FILE, check_most
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Files of objects and cameras that are not read: what they are, and the program and command that convert them.
@@ -97,7 +92,6 @@ def advice(path: Path) -> str | None:
     return next((f"{what}: {how.format(file=shlex.quote(name), **names)}" for what, how in said), None)
 
 
-LARGEST_FILE = 1 << 29  # bytes that a mesh, a texture or an environment may have, before `advsearch.files.scaled`
 _LONGEST_NAME = 100
 _KINDS = (
     (b"\x89PNG", "a PNG picture"),
@@ -138,12 +132,12 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
                 raise FileFormatError(f"{file}: has no parts by name, got #{shown(part, quoted=False)}; leave it out")
             known = None if what == "environment" else advice(Path(file) if file else path)
             if known is not None:
-                raise FileFormatError(f"{path}: {known} (read are {files.either(suffixes)})")
+                raise FileFormatError(f"{path}: {known} (read are {either(suffixes)})")
             got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
             raise FileFormatError(
-                f"{path}: expected an {what} file ending in {files.either(suffixes)}, {got}; convert it to one of these"
+                f"{path}: expected an {what} file ending in {either(suffixes)}, {got}; convert it to one of these"
             )
-        data = files.read_bytes(path, f"an {what} file", LARGEST_FILE)
+        data = stored_files.read_bytes(path, f"an {what} file", LARGEST_FILE)
     except FileNotFoundError as error:
         hint = "" if path.parent.is_dir() else f" The folder {path.parent} does not exist either."
         with suppress(OSError):
@@ -236,15 +230,8 @@ def clean(name: str) -> str:
 
 
 LARGEST_FACES = 2_000_000
-"""Triangles that a mesh may have, before `advsearch.files.scaled`; each takes over 1 KB of memory to import."""
+"""Triangles that a mesh may have, before `scaled`; each takes over 1 KB of memory to import."""
 MOST_CORNERS = 10_000  # corners that one face may have
-
-
-def check_most(path: Path | str, count: int, limit: int, expected: str, got: str | None = None) -> None:
-    """Raise FileFormatError where a file has more of something than a limit, before `advsearch.files.scaled`; what was
-    expected has {} in the place of that, and what it got is the count by itself."""
-    if count > (most := files.scaled(limit)):
-        raise files.too_large(path, expected.format(f"{most:,}"), f"{count:,}" if got is None else got)
 
 
 def check_faces(path: Path | str, count: int, got: str | None = None) -> None:
@@ -300,80 +287,3 @@ class Notes:
             if (kind, name) not in self._taken:
                 times = "" if count == 1 else f" ({count:,} times)"
                 yield f"{self.source}: {kind} {shown(name)}{times} is left out"
-
-
-MISSING = "is missing"
-OUTSIDE = "is outside its folder and is not read"
-_NO_SUCH_NAME = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EINVAL)
-
-
-def plain_name(name: str) -> str:
-    """Return a file name as it is written on this system: no quotes, no percent signs, forward slashes."""
-    return unquote(name.strip().strip('"')).replace("\\", "/")
-
-
-class References:
-    """Finds the files that a mesh file names. `refused` are those that it could not get, as `plain_name` gives them,
-    and why: `MISSING`, `OUTSIDE` or another clause."""
-
-    def __init__(self, path: Path) -> None:
-        self.refused: dict[str, str] = {}
-        self._folder = os.path.realpath(path.parent)
-        self._contents: dict[str, bytes] = {}
-        self._size = 0
-
-    def get(self, name: str) -> bytes:
-        """Return the content of a named file; after the name as it stands, its usual distortions are tried. Raises
-        FileNotFoundError: it is not there, or must not be read; `refused` says which."""
-        content = self.tried(name)
-        if isinstance(content, bytes):
-            return content
-        self.refused[plain_name(name)] = content
-        raise FileNotFoundError(name)
-
-    def tried(self, name: str) -> bytes | str:
-        """Return the content of a named file, or why it is not read, which is not remembered."""
-        reason = MISSING
-        spellings = (name.strip(), plain_name(name))
-        forms = [form for text in spellings for form in (text, text.lstrip("/"), os.path.basename(text))]
-        for form in filter(None, dict.fromkeys(forms)):
-            try:
-                return self._content(form)
-            except ValueError:  # a zero byte in the name
-                continue
-            except OSError as error:
-                reason = reason if error.errno in _NO_SUCH_NAME else f"cannot be read ({error.strerror})"
-            except FileFormatError as error:
-                reason = str(error)
-        return reason
-
-    def _content(self, name: str) -> bytes:
-        path = os.path.realpath(os.path.join(self._folder, name))
-        if os.path.commonpath((path, self._folder)) != self._folder:
-            raise FileFormatError(OUTSIDE if os.path.lexists(path) else MISSING)
-        if path not in self._contents:
-            try:
-                data = files.read_bytes(Path(path), "an ordinary file", LARGEST_FILE)
-                check_most(path, self._size + len(data), LARGEST_FILE, "files of at most {} bytes in all")
-            except FileFormatError as error:
-                raise FileFormatError(f"is not read ({str(error).removeprefix(f'{path}: ')})") from error
-            self._contents[path] = data
-            self._size += len(data)
-        return self._contents[path]
-
-
-def run_converter(
-    path: Path, program: str, command: Sequence[str], *, folder: str | Path, seconds: int, env: Mapping[str, str] | None
-) -> subprocess.CompletedProcess[str]:
-    """Run a program that makes glTF of the file at `path`, in a folder, and return what it said. Raises OSError: it
-    can't be started; FileFormatError: it takes longer than so many seconds, before `advsearch.files.scaled`."""
-    longest, unread = files.scaled(seconds), subprocess.DEVNULL
-    try:
-        return subprocess.run(
-            command, cwd=folder, env=env, stdin=unread, capture_output=True, errors="replace", timeout=longest
-        )
-    except subprocess.TimeoutExpired:
-        raise FileFormatError(
-            f"{path}: {program} had not read it after {longest} seconds; export glTF (.glb) from it yourself, or give "
-            f"it longer: {files.FACTOR}=10 in the environment makes all limits ten times as large"
-        ) from None

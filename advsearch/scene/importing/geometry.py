@@ -16,7 +16,6 @@ from advsearch.scene.assets import Bools, Doubles, Ints, Mesh, face_vectors
 from advsearch.scene.importing.files import Notes
 from advsearch.scene.importing.parts import ImportedPart
 
-UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # from y up to z up
 WELD = 1e-6
 """Points closer than this share of the largest extent are one point; text and 32-bit files round to about that."""
 FLAT = 1e-12  # twice the area, in squared extents, up to which a face counts as having none
@@ -58,10 +57,19 @@ class Soup:
         return face_vectors(self.points[self.faces])
 
 
-def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
-    """Join parts, at least one, into one soup of unit extent, z up, with welded points; where the file's y axis points
-    up, it is turned about x by 90 degrees, which keeps handedness. Raises InputError, with the name of the file:
-    vertices that are NaN or infinite, or no extent."""
+def compute_turn(up: str, front: str) -> Doubles:
+    """Return the rotation (3, 3) from a file's axes to ours, where its front faces +x and its up axis +z.
+
+    `up` is "y" or "z", `front` one of `FACINGS` along another axis.
+    """
+    ahead = np.eye(3)["xyz".index(front[1])] * (-1.0 if front[0] == "-" else 1.0)
+    above = np.eye(3)["xyz".index(up)]
+    return np.stack([ahead, np.cross(above, ahead), above]) + 0.0  # no zero has a sign
+
+
+def join(parts: Sequence[ImportedPart], source: str, turn: Doubles) -> Soup:
+    """Join parts, at least one, into one soup of unit extent with welded points, turned by a rotation (3, 3). Raises
+    InputError, with the name of the file: vertices that are NaN or infinite, or no extent."""
     vertices = np.concatenate([part.vertices for part in parts])
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
     bad = ~np.isfinite(vertices).all(axis=1)
@@ -72,7 +80,6 @@ def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
             f" coordinates (the first: {vertices[first].tolist()}); repair the mesh or export it again"
         )
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
-    turn = UPRIGHT if y_up else np.eye(3)
     low, size = vertices[np.unique(faces)].min(axis=0), extent_of(parts)
     if not 0.0 < size < np.inf:
         what = "all vertices coincide" if size == 0.0 else "its extent is too large to compute with"

@@ -14,22 +14,13 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
 from advsearch.scene.assets import Doubles, Ints
-from advsearch.scene.importing.files import (
-    SPLATS,
-    References,
-    check_faces,
-    check_most,
-    damaged,
-    looks_like,
-    plain_name,
-    shown,
-    text_of,
-)
+from advsearch.scene.importing.files import SPLATS, check_faces, damaged, looks_like, shown, text_of
 from advsearch.scene.importing.gltf_entries import Asset, Entry, Header, Primitive
+from advsearch.trust.named_files import References, plain_name
+from advsearch.trust.stored_files import check_most, parse_json
 
 MOST_VALUES = 1_000_000
 """Lists, objects and values in a header; each takes hundreds of bytes of memory, and may take two of the file."""
@@ -43,7 +34,7 @@ def read_header(path: Path, data: bytes) -> Header:
     text = text_of(chunk)
     check_most(path, sum(map(text.count, ",[{")), MOST_VALUES, "a glTF header of at most {} values", "more")
     try:
-        content = files.parse_json(text)
+        content = parse_json(text)
     except ValueError as error:
         kind, reason = looks_like(chunk), str(error)
         if "another kind" in kind:

@@ -10,17 +10,18 @@ from typing import NamedTuple
 import numpy as np
 
 from advsearch.scene.assets import Doubles, Ints
-from advsearch.scene.importing.files import Names, check_most, clean, damaged
+from advsearch.scene.importing.files import Names, clean, damaged
 from advsearch.scene.importing.gltf import GltfFile
 from advsearch.scene.importing.gltf_entries import Animation, Channel, Header, Node, Primitive, Skin
 from advsearch.scene.importing.parts import ImportedPart, put
 from advsearch.scene.skeleton import Clip, Skeleton, Target, Track, entries_of_turn, with_above
+from advsearch.trust.stored_files import check_most
 
 MOST_SETS = 8  # sets of four joints of a vertex
 MOST_KEYS = 1 << 24
-"""Numbers in the keys of all clips together, before `advsearch.files.scaled`; one accessor may stand for many."""
+"""Numbers in the keys of all clips together, before `scaled`; one accessor may stand for many."""
 MOST_MOVES = 1 << 25
-"""Vertices that all morph targets move together, and inverse bind matrices, before `advsearch.files.scaled`."""
+"""Vertices that all morph targets move together, and inverse bind matrices, before `scaled`."""
 WIDTHS = {"translation": 3, "rotation": 4, "scale": 3, "weights": 1}
 """Numbers of a value of each property that a channel may set; of `weights`, of each morph target."""
 SHORTEST = 1e-6  # length of a quaternion, at least; the format says 1

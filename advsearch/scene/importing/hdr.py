@@ -23,11 +23,12 @@ import OpenEXR
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.pictures import LARGEST_PIXELS, check_pixels
 from advsearch.scene.assets import Floats
-from advsearch.scene.importing.files import check_most, damaged, looks_like, shown
+from advsearch.scene.importing.files import damaged, looks_like, shown
+from advsearch.trust.stored_files import check_most
 
 Plane = npt.NDArray[np.floating]
 Planes = tuple[Plane, Plane, Plane]
-LARGEST = 2 * LARGEST_PIXELS  # pixels times channels of a file (8192 x 4096 with 4), before `advsearch.files.scaled`
+LARGEST = 2 * LARGEST_PIXELS  # pixels times channels of a file (8192 x 4096 with 4), before `scaled`
 COLORS = {"r": "R", "red": "R", "g": "G", "green": "G", "b": "B", "blue": "B", "y": "Y", "ry": "RY", "by": "BY"}
 """Names of channels, in any case, and what they hold."""
 WHOLE = ("", "rgba", "rgb", "beauty", "combined", "color", "colour", "main", "image")

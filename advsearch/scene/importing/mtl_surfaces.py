@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from advsearch.scene.assets import Doubles, Floats, Ints
-from advsearch.scene.importing.files import Notes, References, plain_name, shown, text_of
+from advsearch.scene.importing.files import Notes, shown, text_of
 from advsearch.scene.importing.parts import (
     NEUTRAL,
     ImportedSurface,
@@ -25,6 +25,7 @@ from advsearch.scene.importing.parts import (
 from advsearch.scene.importing.pictures import FilePictures, Kind
 from advsearch.scene.importing.texture import mean_over
 from advsearch.scene.importing.unread import TrackedKeys
+from advsearch.trust.named_files import References, plain_name
 
 QUIET = frozenset("ka ks ns ni sharpness map_aat".split())
 """Statements of every file whose terms (ambient light, Phong's highlights) have no place in a physical material."""

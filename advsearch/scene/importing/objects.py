@@ -19,20 +19,22 @@ from scipy.spatial import ConvexHull, QhullError
 from advsearch.errors import InputError
 from advsearch.pictures import without_pillows_limit
 from advsearch.scene.assets import (
+    FACINGS,
     LARGEST,
     SMALLEST,
     Doubles,
+    FileAxis,
     Floats,
     Material,
     Mesh,
     ObjectAsset,
-    UpAxis,
     grouped,
     normalised,
 )
 from advsearch.scene.importing import gltf, gltf_parts
 from advsearch.scene.importing.files import Notes, safe_name, shown
-from advsearch.scene.importing.geometry import UPRIGHT, Soup, assemble, extent_of, join, repaired
+from advsearch.scene.importing.geometry import Soup, assemble, compute_turn, extent_of, join, repaired
+from advsearch.scene.importing.gltf_entries import Header
 from advsearch.scene.importing.parts import ImportedPart, ImportedSurface, visible
 from advsearch.scene.importing.readers import GLTF, get_reader, list_suffixes, read_mesh_bytes
 from advsearch.scene.importing.texture import by_material, textured
@@ -51,14 +53,17 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
 MOST_WARNINGS = 20  # warnings about one file
 
 
-def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = None) -> ObjectAsset:
+def import_object(
+    path: str | PathLike[str], *, up: Literal["y", "z"] | None = None, facing: str | None = None
+) -> ObjectAsset:
     """Read an object from a mesh file, one of `advsearch.files.MESHES`, with the files beside it that it refers to;
-    `up` is the axis that points up in it, None for what the format or else the shape says.
+    `up` is the axis that points up in it, None for what the format or else the shape says; `facing`, one of
+    `FACINGS`, the one along which its front faces, None for what the format says (`find_front`).
 
     What becomes of materials, units and axes is in docs/scenes.md ("Your own object"). The geometry is repaired:
 
-    - All of it is joined, with the transforms of the file's scene graph, turned z up by 90 degrees about x where it is
-      y up, scaled to a largest extent of 1 and set on z = 0.
+    - All of it is joined, with the transforms of the file's scene graph, turned z up with its front towards +x, scaled
+      to a largest extent of 1 and set on z = 0.
     - Faces without area are removed, the winding is made consistent, closed shells that are inside out are turned over.
     - Normals are the file's; where it has none, or they contradict the faces, they are computed: smooth, with creases
       where faces meet at more than 40 degrees; flat in glTF.
@@ -67,30 +72,84 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
 
     What is left out or changed is named in the warnings. The same file gives the same bytes every time. Raises
     FileFormatError: the file is missing, of another kind, damaged, or holds no faces; the message names it. Raises
-    InputError: `up` is neither, or the geometry has NaN, infinite, or coincident vertices only.
+    InputError: `up` is neither, `facing` none of them or along the same axis, or the geometry has NaN, infinite, or
+    coincident vertices only.
     """
     if up not in (None, "y", "z"):
         raise InputError(f"up axis: expected 'y' or 'z', got {up!r}")
     file = Path(path)
     data = read_mesh_bytes(file, "object", list_suffixes())
     parts, notes = read_parts(file, data)
-    notes += gltf_parts.beside(gltf.read_header(file, data), file.name) if file.suffix.lower() in GLTF else []
-    return object_of(parts, notes, file, safe_name(file), up)
+    header = gltf.read_header(file, data) if file.suffix.lower() in GLTF else None
+    notes += [] if header is None else gltf_parts.beside(header, file.name)
+    if facing is None:
+        front = find_front(file, header, up)
+    else:
+        front = FileAxis(check_facing(facing, up if header is None else up or "y"))
+    return object_of(parts, notes, file, safe_name(file), up, front)
 
 
-def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str, up: str | None) -> ObjectAsset:
+def check_facing(facing: str, up: str | None) -> str:
+    """Return an axis of `FACINGS`, of which a sign of plus may be left out. Raises InputError: it is none, or the axis
+    that points up."""
+    axis = facing if facing.startswith(("+", "-")) else f"+{facing}"
+    if axis not in FACINGS:
+        raise InputError(f"facing: expected an axis of the file, one of {', '.join(FACINGS)}, got {facing!r}")
+    if axis[1] == up:
+        raise InputError(f"facing: {facing} is along the axis that points up, {up}; give another one, or another `up`")
+    return axis
+
+
+OUR_FRONT = "+x"
+"""What is taken for the front where a format has no rule: the axis along which bundled objects face."""
+UP_OF_FRONT = {"y": "z", "z": "y"}  # the axis that points up where the front is along another one that might
+BLEND = ".blend"
+USD = (".usd", ".usda", ".usdc", ".usdz")
+VRM_0, VRM_1 = "VRM", "VRMC_vrm"  # extensions of glTF
+
+
+def find_front(path: Path, header: Header | None, up: str | None = None) -> FileAxis:
+    """Return the axis along which the front of what is in a file faces, by the rule of its format; `header` is that of
+    a glTF file, or of what was converted to glTF.
+
+    The front of a glTF asset faces +Z (Khronos, glTF 2.0, section 3.4), which is -Y in Blender. VRM 1.0 says the same,
+    VRM 0.x says -Z. OBJ, PLY, STL and OpenUSD have no rule, nor has a glTF file that is said to be z up.
+    """
+    suffix = path.suffix.lower()
+    if header is None or suffix in USD or up == "z":
+        axis, rule = OUR_FRONT, "a format without a rule, as bundled objects face"
+    elif VRM_0 in header.extensionsUsed and VRM_1 not in header.extensionsUsed:
+        axis, rule = "-z", "as VRM 0 says"
+    elif suffix == BLEND:
+        axis, rule = "+z", "-y in Blender, as its front view shows"
+    else:
+        axis, rule = "+z", "as glTF says"
+    other = f"-{axis[1]}" if axis[0] == "+" else f"+{axis[1]}"
+    return FileAxis(
+        axis,
+        f"{path.name}: its front is taken to face {axis} of the file ({rule}); if it faces another way, give that, "
+        f"such as `facing={other}`",
+    )
+
+
+def object_of(
+    parts: list[ImportedPart], notes: list[str], file: Path, name: str, up: str | None, front: FileAxis
+) -> ObjectAsset:
     """Return the object of that name which some parts of a file, at least one, make up; `notes` are warnings about them
-    so far, and `up` as in `import_object`. Raises InputError: the geometry has NaN, infinite, or coincident vertices
-    only."""
+    so far, `up` as in `import_object`, and `front` the axis of its front. Raises InputError: the geometry has NaN,
+    infinite, or coincident vertices only."""
     seen, more, gltf_file = visible(parts), Notes(file), file.suffix.lower() in GLTF
     clear = ", ".join(dict.fromkeys(shown(part.surface.name or "a part") for part in parts if part not in seen))
     if clear:
         more.say(f"all light passes through {clear} (opacity 0): left out; give it an opacity to see it")
-    parts, known = seen, up or ("y" if gltf_file else None)
-    soup = join(parts, str(file), y_up=known == "y")
-    axis = guess_up(soup.points[np.unique(soup.faces)], file.name) if known is None else UpAxis(known)
-    if known is None and axis.axis == "y":
-        soup = join(parts, str(file), y_up=True)
+    parts, known = seen, up or ("y" if gltf_file else UP_OF_FRONT.get(front.axis[1]))
+    if known is None:
+        as_stored = join(parts, str(file), np.eye(3))
+        axis = guess_up(as_stored.points[np.unique(as_stored.faces)], file.name)
+    else:
+        axis = FileAxis(known)
+    turn = compute_turn(axis.axis, front.axis)
+    soup = join(parts, str(file), turn)
     surfaces = [part.surface for part in parts]
     soup, maps = textured(repaired(soup, str(file), more), surfaces, more)
     opacity = np.ascontiguousarray(maps.color[:, :, 3]) if maps.color.shape[2] == 4 else None
@@ -111,12 +170,13 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     extent = extent_of(parts) * float(np.ptp(soup.points[soup.faces].reshape(-1, 3), axis=0).max())
     return ObjectAsset(
         name=name,
-        mesh=_mesh(soup, surfaces, file, parts, UPRIGHT if axis.axis == "y" else np.eye(3)),
+        mesh=_mesh(soup, surfaces, file, parts, turn),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=Material(roughness=roughness, metallic=metallic),
         source=str(file),
         warnings=tuple(warnings),
         up=axis,
+        front=front,
         opacity=opacity,
         normal_map=maps.normals,
         emission=_let_out(maps.emission, opacity),
@@ -158,7 +218,7 @@ TOUCHING = 0.02
 CLEAR = 1.1  # the shares of two axes differ by more than this factor, or the shape does not tell which one is up
 
 
-def guess_up(points: Doubles, name: str) -> UpAxis:
+def guess_up(points: Doubles, name: str) -> FileAxis:
     """Return the axis that points up, y or z, by the shape of vertices (P, 3) alone; z where that does not tell.
 
     What stands on a table touches it with a large part of what it covers, seen from above: the foot of a vase, the four
@@ -171,7 +231,7 @@ def guess_up(points: Doubles, name: str) -> UpAxis:
     if shares[axis] > CLEAR * shares[other]:
         on, otherwise = (f"{100 * shares[way]:.0f} %" for way in (axis, other))
         why = f"it then rests on {on} of what it covers, seen from above, and on {otherwise} otherwise"
-    return UpAxis(axis, f"{name}: {axis} is taken for up, because {why}; if it lies on its side, give `up={other}`")
+    return FileAxis(axis, f"{name}: {axis} is taken for up, because {why}; if it lies on its side, give `up={other}`")
 
 
 def touching_share(points: Doubles) -> float:

@@ -18,7 +18,9 @@ from advsearch.errors import FileFormatError
 from advsearch.pictures import FORMATS, LARGEST_PIXELS, check_decodable, check_pixels, opened, steps_of
 from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.files import LARGEST_FILE, Notes, References, check_most, plain_name, shown
+from advsearch.scene.importing.files import Notes, shown
+from advsearch.trust.named_files import References, plain_name
+from advsearch.trust.stored_files import LARGEST_FILE, check_most
 
 TEXTURE_LIMIT = 1024  # longest side of an imported texture, in texels; larger ones are averaged down
 _BAND = 1 << 22  # pixels of a large picture that are averaged at a time
@@ -121,7 +123,7 @@ def _overlaps(source: int, target: int) -> sparse.csr_array:
 
 Kind = Literal["colours", "colours and alpha", "numbers"]  # what a picture holds
 LARGEST_SUM = 2 * LARGEST_PIXELS
-"""Pixels that the colour textures of a file may have in all, and those of numbers, before `advsearch.files.scaled`."""
+"""Pixels that the colour textures of a file may have in all, and those of numbers, before `scaled`."""
 UNREADABLE = "cannot be read as a picture"
 MOST_TEXTURES = 16
 """Materials whose textures are kept at `TEXTURE_LIMIT`; more are baked into one map, for which less will do."""

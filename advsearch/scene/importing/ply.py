@@ -13,19 +13,11 @@ import numpy.typing as npt
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Doubles, Ints
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import (
-    MOST_CORNERS,
-    SPLATS,
-    Notes,
-    References,
-    is_number,
-    numbers_in,
-    shown,
-    text_of,
-)
+from advsearch.scene.importing.files import MOST_CORNERS, SPLATS, Notes, is_number, numbers_in, shown, text_of
 from advsearch.scene.importing.geometry import cut_up
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, alike, split_at_corners
 from advsearch.scene.importing.pictures import FilePictures
+from advsearch.trust.named_files import References
 
 Numbers = npt.NDArray[np.generic]
 _TYPES = {

@@ -1,7 +1,7 @@
 """Scenes from glTF files: ``--object scene.glb#chair`` takes one node as the object and the rest as its surroundings.
 
 Lengths are in object sizes, so everything is moved and scaled with the object: its largest extent is 1, it stands on
-z = 0, and z is up.
+z = 0, and z is up. The axis of the file that its format calls the front of an asset is +x.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Doubles, ObjectAsset, face_vectors, footing
 from advsearch.scene.importing import gltf, gltf_parts
 from advsearch.scene.importing.files import Names, clean, safe_name, shown
-from advsearch.scene.importing.geometry import FLAT, UPRIGHT
+from advsearch.scene.importing.geometry import FLAT, compute_turn
 from advsearch.scene.importing.gltf_entries import GENERATOR, CameraEntry, Header, LightEntry
 from advsearch.scene.importing.gltf_skeleton import poses
-from advsearch.scene.importing.objects import object_of, read_parts
+from advsearch.scene.importing.objects import find_front, object_of, read_parts
 from advsearch.scene.importing.parts import ImportedPart, visible
 from advsearch.scene.importing.readers import GLTF, list_suffixes, read_mesh_bytes
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
@@ -85,12 +85,14 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     if (count := len(others) + len(lamps)) > MOST_SURROUNDINGS:
         most = f"at most {MOST_SURROUNDINGS} meshes and lights beside the object"
         raise InputError(f"{path}: expected {most}, got {count}; join some of them in the file")
-    frame, names = _frame(chosen_parts), Names(TAKEN)
+    front = find_front(path, header)
+    turn = compute_turn("y", front.axis)
+    frame, names = _frame(chosen_parts, turn), Names(TAKEN)
     called = _mesh_names(header, parts, names)
     surroundings: list[ScenePart] = []
     for number in others:
         group = [part for part in parts if part.node == number]
-        place, shape = _frame(group), object_of(group, [], path, called[number], "y")
+        place, shape = _frame(group, turn), object_of(group, [], path, called[number], "y", front)
         notes.extend(shape.warnings)
         matrix = np.eye(4)
         matrix[:3, :3] *= place.size / frame.size
@@ -108,7 +110,7 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         for index, name in _camera_names(header, places).items()
     }
     notes.extend(gltf_parts.lights_and_cameras(header, path.name))
-    whole = object_of(chosen_parts, notes, path, f"{safe_name(path)}-{clean(node)}", "y")
+    whole = object_of(chosen_parts, notes, path, f"{safe_name(path)}-{clean(node)}", "y", front)
     return ImportedScene(whole, tuple(surroundings), cameras)
 
 
@@ -160,10 +162,10 @@ def contents(path: Path) -> Contents:
     data = read_mesh_bytes(path, "object", (*list_suffixes(), MITSUBA_FILE))
     parts, notes = read_parts(path, data)
     if path.suffix.lower() not in GLTF:
-        return Contents(object_of(parts, notes, path, safe_name(path), None))
+        return Contents(object_of(parts, notes, path, safe_name(path), None, find_front(path, None)))
     header = gltf.read_header(path, data)
     notes += gltf_parts.lights_and_cameras(header, path.name)
-    whole = object_of(parts, notes, path, safe_name(path), None)
+    whole = object_of(parts, notes, path, safe_name(path), None, find_front(path, header))
     nodes: dict[int, list[ImportedPart]] = {}
     for part in parts:
         nodes.setdefault(part.node, []).append(part)
@@ -180,16 +182,17 @@ def contents(path: Path) -> Contents:
 
 @dataclass(frozen=True, eq=False)
 class FileFrame:
-    """How something lies in the file, z up: its own coordinates times `size`, plus `origin` (3,)."""
+    """How something lies in the file, turned to our axes: its own coordinates times `size`, plus `origin` (3,)."""
 
     size: float
     origin: Doubles
+    turn: Doubles  # (3, 3) from the file's axes to ours
 
     def inside(self, places: Doubles) -> Doubles:
         return np.asarray((places - self.origin) / self.size)
 
 
-def _frame(parts: Sequence[ImportedPart]) -> FileFrame:
+def _frame(parts: Sequence[ImportedPart], turn: Doubles) -> FileFrame:
     """The frame in which the parts have a largest extent of 1, stand on z = 0 and are centred in x and y."""
     corners = []
     for part in visible(parts):
@@ -197,11 +200,11 @@ def _frame(parts: Sequence[ImportedPart]) -> FileFrame:
         area = np.linalg.norm(face_vectors(triangles), axis=1)
         extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
         corners.append(triangles[area > FLAT * extent**2].reshape(-1, 3))
-    places = np.concatenate(corners) @ UPRIGHT.T
+    places = np.concatenate(corners) @ turn.T
     if not np.isfinite(places).all() or not len(places) or not np.ptp(places, axis=0).max() > 0.0:
-        return FileFrame(1.0, np.zeros(3))  # refused with a reason when it is repaired
+        return FileFrame(1.0, np.zeros(3), turn)  # refused with a reason when it is repaired
     origin, size = footing(places)
-    return FileFrame(size, origin)
+    return FileFrame(size, origin, turn)
 
 
 def _unit_of_light(header: Header, both: bool) -> tuple[float, str]:
@@ -223,10 +226,10 @@ def _lamp(
 ) -> PointLamp | SpotLamp:
     power = np.array(light.color) * light.intensity / unit
     if light.type == "directional":
-        way = UPRIGHT @ pose[:3, 2]  # it shines along its -z
+        way = frame.turn @ pose[:3, 2]  # it shines along its -z
         place, power = gltf_parts.FAR * way / max(float(np.linalg.norm(way)), 1e-12), power * gltf_parts.FAR**2
     else:
-        place, power = frame.inside(UPRIGHT @ pose[:3, 3]), power / frame.size**2
+        place, power = frame.inside(frame.turn @ pose[:3, 3]), power / frame.size**2
     if not (np.abs([*place, *power]) <= FURTHEST).all():  # NaN is not
         raise InputError(
             f"{path}: expected the light {name} within {FURTHEST:g} object sizes, and no brighter than that, got "
@@ -237,7 +240,7 @@ def _lamp(
     lamp = PointLamp(name, dark=not power.any(), position=(x, y, z), intensity=(red, green, blue))
     if light.type != "spot":
         return lamp
-    along = UPRIGHT @ -pose[:3, 2]
+    along = frame.turn @ -pose[:3, 2]
     across, up, ahead = map(float, along / max(float(np.linalg.norm(along)), 1e-12))
     cutoff, beam = math.degrees(light.spot.outerConeAngle), math.degrees(light.spot.innerConeAngle)
     return SpotLamp(**vars(lamp), direction=(across, up, ahead), cutoff=cutoff, beam=beam)
@@ -245,10 +248,10 @@ def _lamp(
 
 def _camera(path: Path, name: str, camera: CameraEntry, pose: Doubles, frame: FileFrame) -> PlacedCamera:
     assert camera.perspective is not None
-    turn = UPRIGHT @ pose[:3, :3] @ BEHIND
+    turn = frame.turn @ pose[:3, :3] @ BEHIND
     matrix = np.eye(4)
     axes = turn / np.maximum(np.linalg.norm(turn, axis=0), 1e-12)
-    matrix[:3, :3], matrix[:3, 3] = axes, frame.inside(UPRIGHT @ pose[:3, 3])
+    matrix[:3, :3], matrix[:3, 3] = axes, frame.inside(frame.turn @ pose[:3, 3])
     ratio = camera.perspective.aspectRatio  # without one, that of the picture holds (section 5.13)
     fov = math.degrees(2.0 * math.atan(math.tan(camera.perspective.yfov / 2.0) * max(ratio or 1.0, 1.0)))
     mirrored = np.linalg.det(axes) < 0.0

@@ -11,15 +11,17 @@ import sys
 import tempfile
 from pathlib import Path
 
-from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.registry import OWN_FOLDER
-from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, run_converter, shown
+from advsearch.scene.importing.files import damaged, looks_like, shown
+from advsearch.trust import stored_files
+from advsearch.trust.code import OWN_FOLDER
+from advsearch.trust.programs import run_converter
+from advsearch.trust.stored_files import LARGEST_FILE, scaled
 
 PACKAGE = ".usdz"
 LAYERS = (".usd", ".usda", ".usdc")
-USD_LONGEST = 120  # seconds that it may take, before `advsearch.files.scaled`
-MEMORY = 8 << 30  # bytes of memory that it may take, before `advsearch.files.scaled`
+USD_LONGEST = 120  # seconds that it may take, before `scaled`
+MEMORY = 8 << 30  # bytes of memory that it may take, before `scaled`
 USD_BEGINNINGS = (b"PXR-USDC", b"#usda", b"PK\x03\x04")
 REFUSED = "refused: "
 _LIMITED = f"""
@@ -53,7 +55,7 @@ def convert_usd(path: Path, data: bytes) -> bytes:
     with tempfile.TemporaryDirectory(prefix="advsearch-usd-") as folder:
         target, inside = Path(folder) / "scene.glb", Path(folder) / "package"
         inside.mkdir()
-        names = [str(files.scaled(MEMORY)), str(path.resolve()), str(target), str(inside)]
+        names = [str(scaled(MEMORY)), str(path.resolve()), str(target), str(inside)]
         program = [sys.executable, "-W", "ignore", "-c", _LIMITED, *names]
         done = run_converter(path, "usd-core", program, folder=OWN_FOLDER, seconds=USD_LONGEST, env=None)
         if done.returncode or not target.is_file():
@@ -65,5 +67,5 @@ def convert_usd(path: Path, data: bytes) -> bytes:
             crashed = f"signal {-done.returncode}" if done.returncode < 0 else shown(last.strip(), quoted=False)
             raise FileFormatError(f"{path}: usd-core could not read it ({crashed}); export or download it again")
         for name in json.loads(done.stdout.splitlines()[-1]):
-            files.note_opened(name)
-        return files.read_bytes(target, "a glTF file", 4 * LARGEST_FILE)
+            stored_files.note_opened(name)
+        return stored_files.read_bytes(target, "a glTF file", 4 * LARGEST_FILE)

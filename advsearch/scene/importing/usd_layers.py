@@ -17,10 +17,12 @@ from typing import Any
 
 from pxr import Ar, Sdf
 
-from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import LARGEST_FILE, check_most, shown
+from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.usd import LAYERS, PACKAGE
+from advsearch.trust import stored_files
+from advsearch.trust.named_files import is_inside
+from advsearch.trust.stored_files import LARGEST_FILE, check_most, scaled
 
 MOST_LAYERS = 1000
 MOST_ENTRIES = 10_000
@@ -52,7 +54,7 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
         entries = archive.infolist()
         size = sum(entry.file_size for entry in entries)
         got = f"{len(entries):,} of {size:,}"
-        most = f"at most {files.scaled(MOST_ENTRIES):,} files of {files.scaled(LARGEST_FILE):,} bytes in all"
+        most = f"at most {scaled(MOST_ENTRIES):,} files of {scaled(LARGEST_FILE):,} bytes in all"
         check_most(name, len(entries), MOST_ENTRIES, most, got)
         check_most(name, size, LARGEST_FILE, most, got)
         for entry in entries:
@@ -98,7 +100,7 @@ def read_packaged(path: str) -> bytes:
     Raises FileFormatError: as `open_package`. Raises KeyError: there is no such file.
     """
     outer, inner = Ar.SplitPackageRelativePathOuter(path)
-    content = files.read_bytes(Path(outer), "a package", LARGEST_FILE)
+    content = stored_files.read_bytes(Path(outer), "a package", LARGEST_FILE)
     while inner:
         name, inner = Ar.SplitPackageRelativePathOuter(inner)
         with open_package(Path(outer).name, content) as archive:
@@ -135,7 +137,7 @@ class _LayerCheck:
             known[path] = None
             self._take(path.stat().st_size)
             if path.suffix.lower() == PACKAGE:
-                content = files.read_bytes(path, "a package", LARGEST_FILE)
+                content = stored_files.read_bytes(path, "a package", LARGEST_FILE)
                 self._check_package(path.name, str(path), content, depth=1)
                 continue
             for name in self._named_in(str(path), path.name):
@@ -146,7 +148,7 @@ class _LayerCheck:
         """Count a layer of a size in bytes against the limits."""
         self._count += 1
         self._size += size
-        most = f"at most {files.scaled(MOST_LAYERS):,} layers"
+        most = f"at most {scaled(MOST_LAYERS):,} layers"
         check_most(self.file.name, self._count, MOST_LAYERS, most, "more, or larger ones")
         check_most(self.file.name, self._size, LARGEST_FILE, most, "more, or larger ones")
 
@@ -157,7 +159,7 @@ class _LayerCheck:
         is_plain = not any(sign in outer for sign in "`[]:\0") and suffix in (*LAYERS, PACKAGE)
         is_plain = is_plain and (not inner or suffix == PACKAGE)
         target = Path(os.path.realpath(path.parent / outer)) if is_plain else self._folder
-        if not is_plain or not target.is_relative_to(self._folder):
+        if not is_plain or not is_inside(target, self._folder):
             raise FileFormatError(
                 f"{self.file.name}: names the layer {name[:100]!r}, which is no USD file in its folder and is not "
                 "read; put it there, or make one file of all with usdcat --flatten"

@@ -20,11 +20,9 @@ import numpy.typing as npt
 from PIL import Image
 from pxr import Ar, Usd, UsdShade
 
-from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.glb import GlbBuffer, mime_type
-from advsearch.scene.importing.files import LARGEST_FILE
 from advsearch.scene.importing.gltf_entries import BORDER, CLAMPED, MIRRORED, REPEAT
 from advsearch.scene.importing.parts import holds_normals
 from advsearch.scene.importing.unread import TrackedKeys, join_names
@@ -36,6 +34,9 @@ from advsearch.scene.importing.usd_pictures import (
     is_marked_srgb,
     is_of_8_bits,
 )
+from advsearch.trust import stored_files
+from advsearch.trust.named_files import MISSING, OUTSIDE, is_inside
+from advsearch.trust.stored_files import LARGEST_FILE
 
 Array = npt.NDArray[Any]
 FIRST = Usd.TimeCode.EarliestTime()
@@ -236,16 +237,20 @@ class Surfaces:
         resolved = str(asset.resolvedPath) or str(self.folder / path)
         outer, inner = Ar.SplitPackageRelativePathOuter(resolved)
         outer = os.path.realpath(outer)
-        is_inside = Path(outer).is_relative_to(self.folder)
+        is_own = is_inside(outer, self.folder)
         data = None
-        if is_inside and os.path.isfile(outer):
+        if is_own and os.path.isfile(outer):
             try:
                 packaged = Ar.JoinPackageRelativePath(outer, inner) if inner else ""
-                data = read_packaged(packaged) if inner else files.read_bytes(Path(outer), "a picture", LARGEST_FILE)
+                data = (
+                    read_packaged(packaged)
+                    if inner
+                    else stored_files.read_bytes(Path(outer), "a picture", LARGEST_FILE)
+                )
             except KeyError:
                 data = None
         if data is None:
-            why = "is missing" if is_inside else "is outside its folder and is not read"
+            why = MISSING if is_own else OUTSIDE
             self.leave(f"the texture {path[:100]!r} of {name} {why}")
             return None
         self.read.append(outer)

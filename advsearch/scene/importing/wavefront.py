@@ -17,15 +17,16 @@ from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Doubles, Ints, face_vectors
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import mtl_surfaces
-from advsearch.scene.importing.files import MOST_CORNERS, Notes, References, is_number, numbers_in, shown, text_of
+from advsearch.scene.importing.files import MOST_CORNERS, Notes, is_number, numbers_in, shown, text_of
 from advsearch.scene.importing.geometry import cut_up
 from advsearch.scene.importing.mtl_surfaces import MtlReader, Painted, libraries_of, without_comment
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, Looked, alike, split_at_corners
+from advsearch.trust.named_files import References
 
 GROUPING = frozenset(("g", "o"))  # statements that only name parts; all parts are joined
 FREE_FORM = "bmat bsp bzp cdc cdp con cstype curv curv2 deg end hole mg parm res scrv sp step surf trim vp".split()
 WITHOUT_FACES = {"p": "points", "l": "lines", **dict.fromkeys(FREE_FORM, "curves and curved surfaces")}
-MOST_NAMED = 10_000  # material files, and materials, that a file may name, before `advsearch.files.scaled`
+MOST_NAMED = 10_000  # material files, and materials, that a file may name, before `scaled`
 BEYOND = 0.01  # how far texture coordinates may lie outside of a texture before it matters how that goes on
 
 

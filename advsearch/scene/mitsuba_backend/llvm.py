@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError, EnvironmentSetupError
-from advsearch.registry import OWN_FOLDER
+from advsearch.trust.code import OWN_FOLDER
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MINIMUM = 17  # the first major version that renders: see the head of this file

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Floats, Mesh, ObjectAsset, UpAxis, normalised
+from advsearch.scene.assets import FileAxis, Floats, Mesh, ObjectAsset, normalised
 from advsearch.scene.importing.files import Notes, clean, safe_name, shown
 from advsearch.scene.importing.geometry import assemble, join
 from advsearch.scene.importing.parts import BRIGHTEST, ImportedPart, ImportedSurface
@@ -157,7 +157,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     mesh, base_color = _painted(mesh, own_uvs, surface, str(shape["type"]), where)
     made = ObjectAsset(
         name=f"{safe_name(source)}-{clean(wanted)}", mesh=normalised(mesh), base_color=base_color, source=str(source),
-        warnings=tuple(notes), up=UpAxis("z"), surface=surface.plugin, emission=light, extent=frame.size,
+        warnings=tuple(notes), up=FileAxis("z"), surface=surface.plugin, emission=light, extent=frame.size,
     )  # fmt: skip
     around: list[ScenePart] = [] if haze is None else [haze]
     cameras: dict[str, PlacedCamera] = {}
@@ -185,7 +185,7 @@ def _painted(mesh: Mesh, own_uvs: bool, surface: shapes.ShapeSurface, kind: str,
     vertices, normals, uvs = (values.astype(np.float64) for values in (mesh.vertices, mesh.normals, mesh.uvs))
     color = ImportedSurface(color=surface.base_color[0, 0])
     part = ImportedPart(vertices, mesh.faces.astype(np.int64), normals, uvs if own_uvs else None, None, color)
-    soup, maps = textured(join([part], where, y_up=False), [color], Notes(where))
+    soup, maps = textured(join([part], where, np.eye(3)), [color], Notes(where))
     return assemble(soup)[0], maps.color
 
 

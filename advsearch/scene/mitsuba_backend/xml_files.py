@@ -19,17 +19,17 @@ from xml.parsers import expat
 
 import numpy as np
 
-from advsearch import files
 from advsearch.errors import FileFormatError
-from advsearch.files import note_opened
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import References, damaged, looks_like, read_bytes, shown
+from advsearch.scene.importing.files import damaged, looks_like, read_bytes, shown
 from advsearch.scene.importing.objects import read_parts
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT, banded_average, read_picture
 from advsearch.scene.library import SUFFIXES as RADIANCE
 from advsearch.scene.library import import_environment, read_light
 from advsearch.scene.mitsuba_backend.meshes import with_inner
 from advsearch.scene.mitsuba_backend.variant import VARIANT, Plugin, fewer_warnings, mi
+from advsearch.trust.named_files import References, is_inside
+from advsearch.trust.stored_files import note_opened, scaled, too_large
 
 SUFFIX = ".xml"
 LARGEST = 1 << 24  # bytes of a file, and of all that it includes
@@ -84,8 +84,8 @@ class _Text:
     def parsed(self, data: bytes) -> ElementTree.Element:
         """Return the tree of a file, comments and blanks included, so that lines stay the same."""
         self.size += len(data)
-        if self.size > files.scaled(LARGEST):
-            raise files.too_large(self.path, f"a scene of at most {files.scaled(LARGEST):,} bytes", f"{self.size:,}")
+        if self.size > scaled(LARGEST):
+            raise too_large(self.path, f"a scene of at most {scaled(LARGEST):,} bytes", f"{self.size:,}")
         parser, tree, depth = expat.ParserCreate(), ElementTree.TreeBuilder(insert_comments=True), 0
 
         def refuse(*_: object) -> None:
@@ -96,8 +96,8 @@ class _Text:
             if not self.elements:
                 self.above = parser.CurrentLineNumber - 1
             depth, self.elements = depth + 1, self.elements + 1
-            if self.elements > files.scaled(MOST_ELEMENTS) or depth > DEEPEST:
-                most = f"at most {files.scaled(MOST_ELEMENTS):,} elements, {DEEPEST} deep"
+            if self.elements > scaled(MOST_ELEMENTS) or depth > DEEPEST:
+                most = f"at most {scaled(MOST_ELEMENTS):,} elements, {DEEPEST} deep"
                 raise FileFormatError(f"{self.path}: expected {most}, got more; split the scene up")
             if tag in ("alias", "path"):
                 where = f"{self.path}: line {parser.CurrentLineNumber}"
@@ -272,7 +272,7 @@ def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin
             raise FileFormatError(f"{path}: {kind} needs {shown(str(name))}, which {reason}") from None
         for candidate in (str(name), os.path.basename(str(name))):
             file = Path(os.path.realpath(os.path.join(path.parent, candidate)))
-            if file.is_file() and file.is_relative_to(os.path.realpath(path.parent)):
+            if file.is_file() and is_inside(file, path.parent):
                 note_opened(file)
                 return file
         raise FileFormatError(f"{path}: {kind} needs {shown(str(name))}; write its name as it is in the folder")

@@ -59,7 +59,11 @@ def room(metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tup
         ("window", pane, black, VARNISH, outside),
         ("lamp", ceiling, white, MATT, lamp[None, None] if dark else None),
     )
-    solids = {"walls": _solid_walls(metres), "furniture": _solid_furniture(metres)}
+    solids = {
+        "walls": _solid_walls(metres),
+        "furniture": _solid_furniture(metres),
+        "lamp": _solid_ceiling(metres),
+    }
     return tuple(
         MeshPart(name, quads.mesh(metres), base, finish, emission=shine, laid=True, solids=solids.get(name, ()))
         for name, quads, base, finish, shine in made
@@ -111,6 +115,13 @@ def _solid_walls(metres: float) -> tuple[Footprint, ...]:
     deep = (y0 - OUTSIDE, y1 + OUTSIDE)
     sides = (((wide[0], x0), deep), ((x1, wide[1]), deep), (wide, (deep[0], y0)), (wide, (y1, deep[1])))
     return tuple(_solid_box(x, y, heights, metres) for x, y in sides)
+
+
+def _solid_ceiling(metres: float) -> tuple[Footprint, ...]:
+    """Return what lies above the ceiling, where its lamp hangs, in units of `metres`."""
+    wide = (LOW[0] - OUTSIDE, HIGH[0] + OUTSIDE)
+    deep = (LOW[1] - OUTSIDE, HIGH[1] + OUTSIDE)
+    return (_solid_box(wide, deep, (HIGH[2], HIGH[2] + OUTSIDE), metres),)
 
 
 def _solid_furniture(metres: float) -> tuple[Footprint, ...]:

@@ -13,12 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from advsearch.files import scaled
 from advsearch.scene.description import OBJECT
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.predictor import BETWEEN, MOST_BYTES, NOISE, Predictor, Refusal, RefusalCause, differs
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP, Arrangement, Light, SurfaceView
+from advsearch.trust.stored_files import scaled
 
 MOST_RAYS = 1 << 21  # rays of cameras of one launch
 TEXELS = 333  # of an environment's map, by which it is known again

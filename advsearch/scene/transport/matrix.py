@@ -27,7 +27,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from advsearch import seeds
-from advsearch.files import scaled
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.assets import Floats, Ints
 from advsearch.scene.mitsuba_backend.denoise import denoise
@@ -35,6 +34,7 @@ from advsearch.scene.mitsuba_backend.transport import Paths, Vertices, mean_of
 from advsearch.scene.parts import PATTERN
 from advsearch.scene.predictor import MOST_BYTES, LinearMap, Predictor
 from advsearch.scene.renderer import InputSpace, Renderer
+from advsearch.trust.stored_files import scaled
 
 Smooth = Callable[[Tensor], Tensor]  # from a noisy picture (H, W, 3) to one without noise
 MOST_MEANS = 6e4  # multiples of its mean up to which a picture is kept; any exposure has clipped them long before

@@ -128,14 +128,13 @@
 
   const STAKES = [1, 0.9, 0.75, 0.5, 0.25, 0.125, 0.0625, 0.03125], ENOUGH = Math.log(40);
   const overUnits = new Map();
-  // The interval over units (drives) that have several rows each, by bets (attacks/units.py), from what units come to:
-  // [right, rows, how many units].
+  // The interval of the mean over units (drives) of the share of each, by bets (attacks/trials.py), from what units come
+  // to: [right, rows, how many units].
   function intervalOver(units) {
     const key = units.map((one) => one.join(" ")).sort().join();
     if (!overUnits.has(key)) {
-      const most = Math.max(...units.map(([, of]) => of));
       const won = (mean, wrong) => {
-        const totals = STAKES.map((stake) => units.reduce((sum, [right, of, times]) => sum + times * Math.log(Math.max(0, 1 - (stake * of) / most + (stake * (wrong ? of - right : right)) / (most * mean))), 0));
+        const totals = STAKES.map((stake) => units.reduce((sum, [right, of, times]) => sum + times * Math.log(Math.max(0, 1 - stake + (stake * (wrong ? of - right : right)) / (of * mean))), 0));
         const top = Math.max(...totals);
         return top === -Infinity ? top : top + Math.log(totals.reduce((sum, one) => sum + Math.exp(one - top), 0) / STAKES.length);
       };
@@ -192,7 +191,7 @@
       };
       for (const name of ["step", "unit", "margin", "probability", "right"]) {
         this.columns[name] = grown(this.columns[name], this.columns[name].constructor);
-        this.columns[name].set(arrays[name] || arrays.step, before); // older files have no unit
+        this.columns[name].set(arrays[name], before);
       }
       this.columns.source = grown(this.columns.source, Uint16Array);
       this.columns.source.fill(source, before);
@@ -206,8 +205,7 @@
       this.columns.answer = grown(this.columns.answer, Uint16Array);
       this.put(this.columns.answer, arrays.answer, this.places(this.answers, head.answers), before);
       this.columns.outcome = grown(this.columns.outcome, Uint16Array);
-      if (arrays.outcome) this.put(this.columns.outcome, arrays.outcome, this.places(this.outcomes, head.outcomes), before);
-      else this.columns.outcome.fill(this.places(this.outcomes, [""])[0], before); // older files have none
+      this.put(this.columns.outcome, arrays.outcome, this.places(this.outcomes, head.outcomes), before);
       head.parameters.forEach((given, number) => {
         const names = given.levels !== null;
         let mine = this.parameters.find((one) => one.name === given.name && (one.levels !== null) === names);
@@ -540,11 +538,24 @@
       return found;
     }
 
-    interval(counts, place) {
+    // What the units of a place come to, where some have several rows: [right, rows, how many units]; null elsewhere.
+    several(counts, place) {
       const units = counts.units && counts.units.get(place);
       const told = units && [...units].map(([key, times]) => [...key.split(" ").map(Number), times]);
-      if (told && told.some(([, of]) => of > 1)) return intervalOver(told);
-      return interval(counts.right[place], counts.judged[place]);
+      return told && told.some(([, of]) => of > 1) ? told : null;
+    }
+
+    interval(counts, place) {
+      const told = this.several(counts, place);
+      return told ? intervalOver(told) : interval(counts.right[place], counts.judged[place]);
+    }
+
+    // The share of right rows; of units with several, the mean over units of the share of each.
+    accuracy(counts, place) {
+      const told = this.several(counts, place);
+      if (!told) return counts.judged[place] ? counts.right[place] / counts.judged[place] : null;
+      const total = told.reduce((sum, [, , times]) => sum + times, 0);
+      return told.reduce((sum, [right, of, times]) => sum + (times * right) / of, 0) / total;
     }
 
     // ---- what is chosen ----------------------------------------------------------------------------------------------
@@ -618,7 +629,7 @@
       const state = this.state, single = { name: "", unit: "", labels: [""], level: new Uint8Array(this.table.count), names: true };
       const across = this.byName.get(state.across) || single, up = this.byName.get(state.up) || single, by = this.byName.get(state.by) || single;
       const counts = this.counted([by, up, across]);
-      const values = Array.from(counts.all, (all, k) => (state.measure === "count" ? all : state.measure === "margin" ? (counts.margins[k] ? counts.margin[k] / counts.margins[k] : null) : counts.judged[k] ? counts.right[k] / counts.judged[k] : null));
+      const values = Array.from(counts.all, (all, k) => (state.measure === "count" ? all : state.measure === "margin" ? (counts.margins[k] ? counts.margin[k] / counts.margins[k] : null) : this.accuracy(counts, k)));
       const finite = values.filter((value) => value !== null);
       const [low, high] = state.measure === "accuracy" ? [0, 1] : finite.length ? [Math.min(...finite), Math.max(...finite)] : [0, 1];
       // The darkest colour is the worst: the smallest accuracy, the smallest margin.
@@ -654,7 +665,7 @@
       const judged = counts.judged[place];
       const [low, high] = judged ? this.interval(counts, place) : [null, null];
       const margin = counts.margins[place] ? `, mean margin ${short(counts.margin[place] / counts.margins[place])}` : "";
-      return `${where}: right in ${counts.right[place]} of ${judged} (${percent(judged ? counts.right[place] / judged : null)}, ${percent(low)} to ${percent(high)})${margin}`;
+      return `${where}: right in ${counts.right[place]} of ${judged} (${percent(this.accuracy(counts, place))}, ${percent(low)} to ${percent(high)})${margin}`;
     }
 
     listen() {
@@ -746,7 +757,7 @@
       parts.forEach((part, series) => axis.labels.forEach((text, level) => {
         const place = series * n + level, judged = counts.judged[place];
         if (!judged) return;
-        const share = counts.right[place] / judged, [low, top] = this.interval(counts, place);
+        const share = this.accuracy(counts, place), [low, top] = this.interval(counts, place);
         const words = `${part ? `${part}, ` : ""}${text}: ${percent(share)}, ${percent(low)} to ${percent(top)}, of ${judged}`;
         const dot = shape(series, x(level, series), y(share));
         marks.push(drawn("g", { class: `series s${series % 6}` }, drawn("title", {}, words), drawn("line", { x1: x(level, series), x2: x(level, series), y1: y(low), y2: y(top) }), dot));

@@ -30,6 +30,7 @@ from advsearch.cluster import InProcess
 from advsearch.engine.image_changes import CHANGED
 from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError
+from advsearch.models.model import ModelWarning
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import attack_once
@@ -362,6 +363,7 @@ def test_a_counterexample_of_another_scene_or_a_damaged_one_is_said(attacked: Pa
 
 
 SETTINGS: dict[str, Any] = {
+    "value_range": [0.0, 255.0], "facing": "-z",
     "object": "mug.obj", "environment": "loft", "up": "y", "size": 4.9, "unit": "cm", "camera": "dashcam",
     "set": {"camera.ev": 11.0}, "things": "person@1,2", "judge": "person", "exposure": -1.5, "resolution": (96, 128),
     "model": "net.pt2", "ensemble": None, "labels": "coco", "prompt": "a photo of a {}", "ask": {"calls": 5.0},
@@ -391,7 +393,13 @@ def test_every_setting_that_decides_a_verdict_is_the_counterexample_s_own(settin
     judged = kept_case(**wanted).config_for(suite, {})
     same = getattr(judged, setting.field) == getattr(AttackConfig(**wanted), setting.field)
     assert same or setting.name in OF_SUITE
-    of_others = {"object": "bowl", "model": "other.pt2", "label": "car", "judge": "all", "task": "classification"}
+    of_others: dict[str, Any] = {
+        "object": "bowl",
+        "model": "other.pt2",
+        "label": "car",
+        "judge": "all",
+        "task": "classification",
+    }
     of_others |= {"environment": "noon", "resolution": 64, "camera": "robot", "exposure": 1.0, "set": {}}
     other = suite_of({"settings": of_others, "claims": {"a": GOOD}}, "suite.yaml")
     judged = kept_case(**wanted).config_for(other, {"model": None, "threads": 1, "deterministic": None})
@@ -730,7 +738,8 @@ def test_a_share_of_the_frames_of_a_drive_is_claimed_as_one(tmp_path: Path) -> N
 
 def always() -> advsearch.Model:
     """Says mug to everything."""
-    return advsearch.load_model(small_models.Blue(-9.0), labels=["mug", "vase"], input_size=32, name="always")
+    with pytest.warns(ModelWarning, match="hardly follow the picture"):
+        return advsearch.load_model(small_models.Blue(-9.0), labels=["mug", "vase"], input_size=32, name="always")
 
 
 def test_assertions_pass_and_fail_with_the_picture_and_what_repeats_them(

@@ -1,0 +1,83 @@
+"""Files that a file names: only those in its own folder and below are read, after links are followed.
+
+The threat: a mesh, a scene, a layer or a summary may come from anywhere, so it may name anything on this machine, which
+would be read into a picture, a page or an export. Of all that a mesh names no more is read than one file may have.
+
+Used by the importers of meshes and scenes (`scene/importing/`, `scene/mitsuba_backend/xml_files.py`) and for pictures
+that a result names (`viewer/pages.py`).
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from urllib.parse import unquote
+
+from advsearch.errors import FileFormatError
+from advsearch.trust import stored_files
+from advsearch.trust.stored_files import LARGEST_FILE, check_most
+
+MISSING = "is missing"
+OUTSIDE = "is outside its folder and is not read"
+_NO_SUCH_NAME = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EINVAL)
+
+
+def plain_name(name: str) -> str:
+    """Return a file name as it is written on this system: no quotes, no percent signs, forward slashes."""
+    return unquote(name.strip().strip('"')).replace("\\", "/")
+
+
+def is_inside(path: Path | str, folder: Path | str) -> bool:
+    """Whether a path leads into a folder or below, after links are followed."""
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+
+
+class References:
+    """Finds the files that a mesh file names. `refused` are those that it could not get, as `plain_name` gives them,
+    and why: `MISSING`, `OUTSIDE` or another clause."""
+
+    def __init__(self, path: Path) -> None:
+        self.refused: dict[str, str] = {}
+        self._folder = os.path.realpath(path.parent)
+        self._contents: dict[str, bytes] = {}
+        self._size = 0
+
+    def get(self, name: str) -> bytes:
+        """Return the content of a named file; after the name as it stands, its usual distortions are tried. Raises
+        FileNotFoundError: it is not there, or must not be read; `refused` says which."""
+        content = self.tried(name)
+        if isinstance(content, bytes):
+            return content
+        self.refused[plain_name(name)] = content
+        raise FileNotFoundError(name)
+
+    def tried(self, name: str) -> bytes | str:
+        """Return the content of a named file, or why it is not read, which is not remembered."""
+        reason = MISSING
+        spellings = (name.strip(), plain_name(name))
+        forms = [form for text in spellings for form in (text, text.lstrip("/"), os.path.basename(text))]
+        for form in filter(None, dict.fromkeys(forms)):
+            try:
+                return self._content(form)
+            except ValueError:  # a zero byte in the name
+                continue
+            except OSError as error:
+                reason = reason if error.errno in _NO_SUCH_NAME else f"cannot be read ({error.strerror})"
+            except FileFormatError as error:
+                reason = str(error)
+        return reason
+
+    def _content(self, name: str) -> bytes:
+        path = os.path.realpath(os.path.join(self._folder, name))
+        if not is_inside(path, self._folder):
+            raise FileFormatError(OUTSIDE if os.path.lexists(path) else MISSING)
+        if path not in self._contents:
+            try:
+                data = stored_files.read_bytes(Path(path), "an ordinary file", LARGEST_FILE)
+                check_most(path, self._size + len(data), LARGEST_FILE, "files of at most {} bytes in all")
+            except FileFormatError as error:
+                raise FileFormatError(f"is not read ({str(error).removeprefix(f'{path}: ')})") from error
+            self._contents[path] = data
+            self._size += len(data)
+        return self._contents[path]

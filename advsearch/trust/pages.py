@@ -1,0 +1,135 @@
+"""Pages that a server of ours sends: to whom, and what they may do in a browser.
+
+The threat: another site in the same browser asks this server, under a name that leads here (DNS rebinding) or from its
+own pages; somebody else on the network asks it; or a page in the folder of a run, which may be somebody else's, runs
+scripts that read other runs or send them away. So a request is for this server's own address, from no other origin, and
+beyond this machine it has the token; and a page runs no script but those of this package.
+
+Used by the dashboard's server (`viewer/server.py`), by the frame of every page (`viewer/document.py`) and for
+photographs (`questions/photographs/result.py`).
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import re
+from collections.abc import Collection, Iterable
+from email.message import Message
+from http import HTTPStatus
+from urllib.parse import parse_qs, urlsplit
+
+from advsearch.trust.network import is_address
+
+LOOPBACK = "127.0.0.1"
+LONGEST = 4096  # characters of an address
+COOKIE = "advsearch"
+
+CLOSED = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(self), microphone=(), geolocation=()",
+}
+"""Headers of every answer, beside its `Content-Security-Policy`."""
+
+
+class Refused(Exception):
+    """A request that is not answered as asked."""
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+def check_request(
+    command: str, path: str, headers: Message, scheme: str, named: str, port: int, token: str | None
+) -> None:
+    """Check that a request may be answered. Raises Refused.
+
+    Args:
+        command: such as "GET".
+        path: what is asked for, with its query.
+        headers: of the request.
+        scheme: that the server speaks, "http" or "https".
+        named: what the server was told to listen at.
+        port: that it listens at.
+        token: what the address or a cookie has to have; None of a server of this machine alone.
+    """
+    if len(path) > LONGEST:
+        raise Refused(HTTPStatus.REQUEST_URI_TOO_LONG, "the address is too long")
+    host = headers.get("Host", "")
+    if not _is_own(host, named, port, token):
+        raise Refused(HTTPStatus.FORBIDDEN, "this server is not called so; open the address that it printed")
+    origin = headers.get("Origin")
+    if origin is not None and origin != f"{scheme}://{host}":
+        raise Refused(HTTPStatus.FORBIDDEN, "a page of another origin asks; open the address that was printed")
+    if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
+        if headers.get("Sec-Fetch-Mode") != "navigate" or command == "POST":
+            raise Refused(HTTPStatus.FORBIDDEN, "a page of another site asks")
+    if token is not None:
+        given = parse_qs(urlsplit(path).query).get("token", [])
+        for part in headers.get("Cookie", "").split(";"):
+            name, _, value = part.strip().partition("=")
+            if name == f"{COOKIE}-{port}":
+                given.append(value)
+        if not any(hmac.compare_digest(token, one) for one in given if one.isascii()):
+            raise Refused(HTTPStatus.UNAUTHORIZED, "the token is missing; open the address that was printed")
+
+
+def _is_own(host: str, named: str, port: int, token: str | None) -> bool:
+    """Whether a request's Host is an address of this server: a name would need a name server to lead here."""
+    name, _, own_port = host.rpartition(":")
+    if not own_port.isdecimal() or int(own_port) != port:
+        return False
+    if token is None:
+        return name in ("localhost", LOOPBACK, "[::1]")
+    return name in ("localhost", named) or is_address(name.removeprefix("[").removesuffix("]"))
+
+
+def token_cookie(port: int, token: str) -> str:
+    """Return what a browser keeps so that links need no token. It is lax: a link on the page of a run, which has an
+    origin of its own, leads back to the list."""
+    return f"{COOKIE}-{port}={token}; HttpOnly; Secure; SameSite=Lax; Path=/"
+
+
+def script_digest(code: bytes) -> str:
+    """Return a script's SHA-256 as a policy names it."""
+    return base64.b64encode(hashlib.sha256(code).digest()).decode()
+
+
+def page_policy(digests: Iterable[str], *, connects: bool) -> str:
+    """Return what a page may load and run; `digests` are those of its scripts."""
+    images, connect = ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
+    runs = "".join(f" 'sha256-{one}'" for one in sorted(digests))
+    scripts = f"; script-src{runs}" if runs else ""
+    return f"default-src 'none'; img-src {images}; style-src 'unsafe-inline'{scripts}{connect}; base-uri 'none'"
+
+
+def served_policy(digests: Iterable[str], *, own: bool) -> str:
+    """Return the `Content-Security-Policy` that a server sends; `digests` are those of all our scripts. A page that it
+    has made itself may ask its server for more. All else lies in the folder of a run, which may be somebody else's: it
+    gets an origin of its own, so that it can read and send nothing, and runs no script but ours."""
+    sandbox = "form-action 'none'; sandbox allow-scripts allow-popups allow-popups-to-escape-sandbox"
+    closed = "form-action 'self'" if own else sandbox
+    return f"{page_policy(digests, connects=own)}; frame-ancestors 'none'; {closed}"
+
+
+def has_other_scripts(page: bytes, digests: Collection[str]) -> bool:
+    """Return whether a page has a script whose digest is none of these. Scripts that are data do not count; one pass,
+    as the page may be somebody else's."""
+    end = 0
+    for opening in re.finditer(rb"<script", page, re.IGNORECASE):
+        if opening.start() < end:
+            continue
+        begin = page.find(b">", opening.end()) + 1
+        if not begin:
+            return False
+        close = re.compile(rb"</script", re.IGNORECASE).search(page, begin)
+        end = close.start() if close else len(page)
+        is_data = page.startswith(b' type="application/', opening.end())
+        if not is_data and script_digest(page[begin:end]) not in digests:
+            return True
+    return False

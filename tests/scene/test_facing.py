@@ -1,0 +1,266 @@
+"""Which way a file faces: by its format, by `facing`, never by its name; and on which side of it a dashcam is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from test_gltf import File
+
+import advsearch
+from advsearch.cli.main import _join_negative_axis
+from advsearch.controls.camera import CameraControl
+from advsearch.engine.loading import load_scene, scene_as_settings
+from advsearch.errors import InputError
+from advsearch.scene import library
+from advsearch.scene.cycles import _turn_for_blender
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.glb import glb
+from advsearch.scene.importing.objects import import_object
+from advsearch.scene.importing.scenes import import_scene
+from advsearch.scene.parts import MeshPart
+
+AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
+LONG, WIDE, HIGH = 4.2, 1.8, 1.4  # metres of the car of boxes
+
+
+def box_car(front: str, up: str = "+y") -> trimesh.Trimesh:
+    """A car of two boxes whose front and top lie along two axes: a mast stands on its left, near its front."""
+    ahead, above = np.array(AXES[front], float), np.array(AXES[up], float)
+    axes = np.stack([ahead, np.cross(above, ahead), above], axis=1)
+    body, mast = trimesh.creation.box((LONG, WIDE, HIGH)), trimesh.creation.box((0.2, 0.2, 0.4))
+    mast.apply_translation([1.8, 0.7, 0.9])
+    car = trimesh.util.concatenate([body, mast])
+    car.vertices = car.vertices @ axes.T
+    return car
+
+
+def write_car(path: Path, front: str, up: str = "+y", extension: str | None = None) -> Path:
+    car = box_car(front, up)
+    if path.suffix not in (".glb", ".vrm"):
+        car.export(path)
+        return path
+    file = File()
+    file.primitive(np.asarray(car.vertices), np.asarray(car.faces).reshape(-1))
+    if extension is not None:
+        file.header["extensions"] = {extension: {}}
+    path.write_bytes(file.write(path.parent).read_bytes())
+    return path
+
+
+def mast_of(path: Path, **settings: Any) -> tuple[int, int]:
+    """On which side the mast is: ahead (1) or behind (-1); to the left (1) or the right (-1); (0, 0) if it lies."""
+    vertices = import_object(path, **settings).mesh.vertices
+    top = vertices[vertices[:, 2] > vertices[:, 2].max() - 1e-4].mean(axis=0)
+    return int(np.sign(round(float(top[0]), 1))), int(np.sign(round(float(top[1]), 1)))
+
+
+AHEAD_LEFT = (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "front", "up", "extension", "settings"),
+    [
+        ("car.glb", "+z", "+y", None, {}),
+        ("car.vrm", "-z", "+y", "VRM", {}),
+        ("car.vrm", "+z", "+y", "VRMC_vrm", {}),
+        ("car.glb", "+x", "+y", None, {"facing": "+x"}),
+        ("car.glb", "-z", "+y", None, {"facing": "-z"}),
+        ("car.glb", "-x", "+y", None, {"facing": "-x"}),
+        ("car.glb", "+y", "+z", None, {"facing": "+y", "up": "z"}),
+        ("car.glb", "+x", "+z", None, {"up": "z"}),
+        ("car.obj", "+x", "+y", None, {"up": "y"}),
+        ("car.ply", "+x", "+z", None, {"up": "z"}),
+        ("car.stl", "-y", "+z", None, {"facing": "-y"}),
+        ("car.obj", "-z", "+y", None, {"facing": "-z"}),
+        ("car.obj", "+z", "+y", None, {"facing": "z"}),
+    ],
+)
+def test_what_is_the_front_of_a_file_faces_x(
+    name: str, front: str, up: str, extension: str | None, settings: dict[str, Any], tmp_path: Path
+) -> None:
+    path = write_car(tmp_path / name, front, up, extension)
+    assert mast_of(path, **settings) == AHEAD_LEFT
+    asset = import_object(path, **settings)
+    assert asset.front is not None and asset.front.axis == front
+    assert ("facing=" in asset.front.reason) == ("facing" not in settings)
+    assert asset.front.reason not in asset.notes  # told where it matters
+
+
+def test_a_facing_that_is_none_or_points_up_is_refused(tmp_path: Path) -> None:
+    path = write_car(tmp_path / "car.glb", "+z")
+    with pytest.raises(InputError, match=r"expected an axis of the file, one of \+x, -x, .*, got 'ahead'"):
+        import_object(path, facing="ahead")
+    with pytest.raises(InputError, match=r"facing: -y is along the axis that points up, y"):
+        import_object(path, facing="-y")
+    with pytest.raises(InputError, match="car is bundled and faces"):
+        load_scene("car", facing="-x")
+    with pytest.raises(InputError, match="a scene file stays as it is"):
+        load_scene(f"{path}#plate", facing="-x")
+    assert _join_negative_axis(["render", "--facing", "-z", "--up", "y"]) == ["render", "--facing=-z", "--up", "y"]
+
+
+# ---- in the lane -----------------------------------------------------------------------------------------------------
+
+
+def place(scene: SceneDescription) -> np.ndarray:
+    return np.asarray(camera_to_world(scene)[:3, 3] * scene.metres)
+
+
+def dashcam(name: object, environment: str = "street", **given: Any) -> SceneDescription:
+    return load_scene(str(name), environment, camera="dashcam", **given).description
+
+
+def test_a_name_or_a_label_does_not_decide_which_side_a_dashcam_sees(tmp_path: Path) -> None:
+    settings: dict[str, dict[str, Any]] = {".glb": {}, ".obj": {"size": LONG, "up": "y"}}
+    for suffix, given in settings.items():
+        scenes = [
+            dashcam(write_car(tmp_path / f"{name}{suffix}", "+z" if suffix == ".glb" else "+x"), **given)
+            for name in ("wcar", "my-car", "thing")
+        ]
+        for scene in scenes:
+            assert place(scene)[0] < -9.0
+            np.testing.assert_array_equal(scene.object.mesh.vertices, scenes[0].object.mesh.vertices)
+            assert sum("its front is taken to face" in note for note in scene.notes) == 1
+    told = load_scene(str(tmp_path / "wcar.obj"), "street", facing="-x", size=LONG)
+    assert not any("front" in note for note in told.description.notes)
+    assert scene_as_settings(told)["facing"] == "-x"
+    studio = load_scene(str(tmp_path / "wcar.glb"), "studio").description
+    assert not any("front" in note for note in studio.notes)
+
+
+@pytest.mark.parametrize(("front", "facing"), [("+z", None), ("+x", "+x")])
+def test_a_dashcam_sees_the_whole_rear_of_a_gltf_car(front: str, facing: str | None, tmp_path: Path) -> None:
+    """1.8 m of width are 24 of 160 pixels: f = 80 / tan 37.5 degrees, and the rear is 10 - 2.1 m away."""
+    path = write_car(tmp_path / "one.glb", front)
+    scene = load_scene(path, "street", camera="dashcam", facing=facing, settings={"camera.distance": 10})
+    render = scene.renderer({"camera": {"azimuth": [-0.01, 0.01]}}, resolution=160)
+    columns = np.flatnonzero((render.mask(render.start).reshape(160, 160) > 0.5).any(dim=0).numpy())
+    width = WIDE / (10.0 - LONG / 2.0) * 80.0 / np.tan(np.radians(37.5))
+    assert len(columns) == pytest.approx(width, abs=1.5)
+    assert columns.mean() == pytest.approx(79.5, abs=1.0)
+
+
+def test_azimuths_around_0_are_behind_the_car(tmp_path: Path) -> None:
+    scene = dashcam("car")
+    assert scene.number("camera.azimuth") == 0.0
+    bound = CameraControl(azimuth=[-5.0, 5.0]).bind(CameraControl(azimuth=[-5.0, 5.0]).prepare(scene))
+    assert not bound.scene.remarks
+    for share, aside in ((0.0, 1), (0.5, 0), (1.0, -1)):
+        x, y, _ = bound.inputs(torch.tensor([share]))["camera.to_world"][:3, 3].numpy() * scene.metres
+        assert x < -9.0
+        assert np.sign(round(float(y), 2)) == aside  # counter-clockwise, seen from above: to the right of those ahead
+
+
+@pytest.mark.parametrize(
+    ("name", "camera", "settings", "told"),
+    [
+        ("car", "dashcam", {}, False),
+        ("car", "dashcam", {"camera.azimuth": 180.0}, True),
+        ("car", "dashcam", {"camera.azimuth": 175.0}, True),
+        ("car", "dashcam", {"camera.azimuth": 90.0}, False),
+        ("car", "dashcam", {"camera.azimuth": 150.0}, False),  # 5 m aside, in the other lane
+        ("car", None, {"camera.azimuth": 0.0, "camera.height": 1.3, "camera.distance": 10.0}, True),
+        ("car", None, {"camera.azimuth": 180.0, "camera.height": 1.3, "camera.distance": 10.0}, False),
+        ("car", None, {"camera.azimuth": 0.0, "camera.elevation": 30.0, "camera.distance": 10.0}, False),
+        ("stop-sign", "dashcam", {}, False),
+    ],
+)
+def test_a_camera_against_the_traffic_is_told(
+    name: str, camera: str | None, settings: dict[str, float], told: bool
+) -> None:
+    scene = load_scene(name, "street", camera=camera, settings=settings).description
+    notes = [note for note in scene.notes if "against the traffic" in note]
+    assert len(notes) == told
+    behind = 0 if camera else 180
+    assert all(note.endswith(f"behind it is `set` camera.azimuth={behind}") for note in notes)
+
+
+def test_a_parked_car_is_not_in_a_lane() -> None:
+    low = {"camera.azimuth": 0.0, "camera.height": 1.3, "camera.distance": 10.0}
+    assert not load_scene("car", "car-park", settings=low).description.notes
+
+
+def test_a_searched_camera_against_the_traffic_is_told() -> None:
+    remarks = CameraControl(azimuth=[178.0, 182.0]).prepare(dashcam("car")).remarks
+    assert len(remarks) == 1 and "against the traffic" in remarks[0]
+    assert not CameraControl(azimuth=[0.0, 360.0]).prepare(dashcam("car")).remarks
+
+
+# ---- beside the object, around it, and written again -----------------------------------------------------------------
+
+
+def test_a_thing_faces_as_its_file_or_its_facing_says(tmp_path: Path) -> None:
+    right, wrong = write_car(tmp_path / "right.glb", "+z"), write_car(tmp_path / "wrong.glb", "-z")
+    things = f"{right}@10,0; {wrong}@20,0,facing=-z; {wrong}@-10,0,name=turned"
+    scene = load_scene("car", "street", things=things).description
+    for name, ahead in (("right", 1), ("wrong", 1), ("turned", -1)):
+        part = scene.things[name]
+        world = part.mesh.vertices @ part.to_world[:3, :3].T
+        top = world[world[:, 2] > world[:, 2].max() - 1e-4].mean(axis=0)
+        middle = (world.max(axis=0) + world.min(axis=0)) / 2.0
+        assert np.sign(top[0] - middle[0]) == ahead
+    assert [note.split(":")[0] for note in scene.notes if "its front is taken" in note] == ["right.glb", "wrong.glb"]
+
+
+def test_a_scene_file_is_turned_as_a_whole(tmp_path: Path) -> None:
+    """What is ahead of the object along the file's +z is ahead along our +x."""
+    file = File()
+    file.primitive()
+    file.header["meshes"].append(file.header["meshes"][0])
+    file.header["nodes"] = [{"mesh": 0, "name": "one"}, {"mesh": 1, "name": "ahead", "translation": [0.0, 0.0, 5.0]}]
+    file.header["scenes"] = [{"nodes": [0, 1]}]
+    scene = import_scene(file.write(tmp_path), "one")
+    (ahead,) = scene.surroundings
+    assert isinstance(ahead, MeshPart)
+    shift = ahead.to_world[:3, 3]
+    assert shift[0] == pytest.approx(5.0) and abs(shift[1]) < 1e-6
+
+
+def file_vertices(data: bytes) -> np.ndarray:
+    """The places of the first mesh in a binary glTF file, as they are written."""
+    length = int.from_bytes(data[12:16], "little")
+    header, buffer = json.loads(data[20 : 20 + length]), data[28 + length :]
+    accessor = header["accessors"][header["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+    start = header["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    return np.frombuffer(buffer, "<f4", 3 * accessor["count"], start).reshape(-1, 3)
+
+
+def test_a_bundled_car_is_written_with_its_front_at_z_and_read_again_as_it_was(tmp_path: Path) -> None:
+    car = library.load_object("car")
+    data = glb([car])
+    written = file_vertices(data)
+    lamps = np.unique(car.mesh.faces[car.mesh.materials["headlight"]])
+    assert written[lamps, 2].min() > 0.3  # of 1, its length
+    assert (written[:, 1].min(), np.ptp(written, axis=0).argmax()) == (pytest.approx(0.0, abs=1e-6), 2)
+    (tmp_path / "again.glb").write_bytes(data)
+    again = import_object(tmp_path / "again.glb").mesh.vertices
+    tree = trimesh.PointCloud(car.mesh.vertices).kdtree
+    assert tree.query(again)[0].max() < 1e-5
+    assert place(dashcam(tmp_path / "again.glb"))[0] < -9.0
+
+
+def test_blender_gets_our_axes() -> None:
+    """Blender reads (x, y, z) of a glTF file as (x, -z, y)."""
+    car = library.load_object("car")
+    x, y, z = file_vertices(glb([_turn_for_blender(car)])).T
+    np.testing.assert_allclose(np.stack([x, -z, y], axis=1), car.mesh.vertices, atol=1e-7)
+
+
+def test_the_command_line_takes_an_axis_with_a_minus(tmp_path: Path) -> None:
+    from advsearch.cli.main import main
+
+    path = write_car(tmp_path / "car.glb", "-z")
+    out = tmp_path / "seen.png"
+    words = ["render", "--object", str(path), "--facing", "-z", "--resolution", "16", "--spp", "1", "--out", str(out)]
+    assert main([*words, "--quiet"]) == 0
+    twin = load_scene(path, facing="-z")
+    assert out.is_file()
+    assert mast_of(path, facing="-z") == AHEAD_LEFT and twin.description.facing == "-z"
+    assert advsearch.load_scene(path).description.facing is None
