@@ -269,7 +269,7 @@ def list_names(kind: str) -> dict[str, str]:
     if isinstance(entries, Registry):
         return {name: entries.get_help(name) for name in entries}
     if isinstance(entries, Mapping):
-        return {str(name): str(text) for name, text in entries.items()}
+        return {str(name): get_first_doc_line(entry) for name, entry in entries.items()}
     return {str(name): "" for name in entries}
 
 
