@@ -55,6 +55,13 @@ def test_a_range_with_a_dip_has_no_one_distance() -> None:
     assert "Beyond that the share falls below a half at 30.8 m; 20 to 80 m with 95 % confidence." in said
 
 
+def test_a_rise_beyond_the_estimate_is_told() -> None:
+    found = seen_from(rows([2, 1, 2, 0, 0], 4))
+    said = distance_sentence(found)
+    assert said.startswith("Seen from 5 m in half of the pictures")
+    assert "right less often: in 1 of 4 at 10 m, 2 of 4 beyond it up to 20 m" in said and "may be chance" in said
+
+
 def test_a_dip_that_chance_explains_is_told_beside_the_estimate() -> None:
     found = seen_from(rows([3, 5, 6, 1, 0], 8))
     assert found.is_monotone

@@ -537,7 +537,12 @@ def _dips_sentences(found: SeenFrom, unit: str) -> list[str]:
     if shown:
         return [f"No one distance from which on it is seen: right in {'; '.join(map(text, shown))}."]
     until = found.distances[-1] if found.everywhere else found.distance or 0.0
-    below_half = [dip for dip in found.dips if dip.seen[0] < HALF * dip.seen[1] and dip.distance < until]
+    below_half = [
+        dip
+        for dip in found.dips
+        if dip.seen[0] < HALF * dip.seen[1]
+        and (dip.distance < until or dip.beyond[0] >= HALF * dip.beyond[1])  # a rise beyond the estimate counts too
+    ]
     if not below_half:
         return []
     deepest = min(below_half, key=lambda dip: dip.p)
