@@ -356,7 +356,7 @@ def test_what_falls_short_at_a_pixel_is_tried_with_other_steps() -> None:
     factors = [factor for _, factor in attempts(replace(several, step=0.05))]
     assert factors == [1.0, 1.0, 3.0, 1.0 / 3.0]  # 9 times would be as wide as 3 times
     assert attempts(group("a.b", 0, 1, ("adjoint",))) == [("adjoint", 1.0)]
-    forced = replace(several, estimator="secant", reason="forced by name")
+    forced = replace(several, estimator="secant", is_forced=True)
     assert [name for name, _ in attempts(forced)] == ["secant"] * 4
 
 
