@@ -315,7 +315,7 @@ def code_with(page: str, word: str) -> dict[str, Any]:
 @pytest.mark.docs
 def test_the_question_that_renders_of_the_design_asks_a_problem() -> None:
     config = AttackConfig(object="mug", controls="pose", resolution=32, denoise="none")
-    assert code_with("design.md", "problem_from_config")["right"](SimpleNamespace(config=config)) in (True, False)
+    assert code_with("design.md", "problem_from_config")["is_right"](SimpleNamespace(config=config)) in (True, False)
 
 
 @pytest.mark.docs

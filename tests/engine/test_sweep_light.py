@@ -10,7 +10,7 @@ from stand_ins import rows
 
 import advsearch
 from advsearch.attacks.domain import Product
-from advsearch.engine import problem as problems
+from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation
 from advsearch.questions.sweep import predicting
 from advsearch.questions.sweep.job import SweptScene
@@ -26,7 +26,7 @@ def _paying(monkeypatch: pytest.MonkeyPatch) -> None:
     """A few dozen pictures are enough here, and the first two views of a comparison decide."""
     monkeypatch.setattr(predicting, "PAYS", 0.2)
     for name in ("BOUND", "MARGIN"):
-        monkeypatch.setattr(problems, name, 50.0)
+        monkeypatch.setattr(acceptance, name, 50.0)
 
 
 def test_pictures_fall_into_groups_that_differ_in_light_alone() -> None:

@@ -14,7 +14,7 @@ from stand_ins import rows
 import advsearch
 from advsearch.attacks.domain import Product
 from advsearch.cluster import BatchResult, WorkerStats
-from advsearch.engine import problem as problems
+from advsearch.engine import acceptance
 from advsearch.engine.acceptance import Deviation
 from advsearch.engine.journal import worker_call
 from advsearch.progress import NullProgress
@@ -42,7 +42,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[SurfaceRenderer]]:
         monkeypatch.setattr(arrangement, name, value)
     monkeypatch.setattr(predicting, "PAYS", 0.0)
     for name, number in {"CHECK_SPP": 2, "BOUND": 50.0, "MARGIN": 50.0}.items():
-        monkeypatch.setattr(problems, name, number)
+        monkeypatch.setattr(acceptance, name, number)
     made, make = list[SurfaceRenderer](), SurfaceRenderer.__init__
 
     def counted(self: SurfaceRenderer, *given: Any) -> None:

@@ -1363,8 +1363,7 @@ def test_real_banana_is_yellow_all_over() -> None:
 
 @real_data
 def test_real_cow_is_the_same_from_both_formats() -> None:
-    one = import_object(DATA / "cow.obj", up="y", facing="+z")  # the front of glTF
-    other = import_object(DATA / "cow.glb")
+    one, other = import_object(DATA / "cow.obj", up="y", facing="+z"), import_object(DATA / "cow.glb")
     assert np.abs(one.base_color - other.base_color).max() < 0.01
     assert other.material.roughness == pytest.approx(0.99)
     points = np.random.default_rng(0).permutation(one.mesh.vertices[one.mesh.faces].mean(axis=1))[:300]
