@@ -213,7 +213,11 @@ def check_other(words: list[str]) -> None:
 
 
 @every_page_with["sh"]
-def test_every_command_in_an_example_is_one_that_the_tools_take(page: Path, tmp_path: Path) -> None:
+def test_every_command_in_an_example_is_one_that_the_tools_take(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "poses.txt").write_text("0 6 0 1 0 0 0 1\n1 4 0 1 0 0 0 1\n")  # a trajectory that a page names
     for words in lines(page):
         command = words[0].removeprefix(".venv/bin/")
         if command == "advsearch":
