@@ -163,7 +163,7 @@ def two_maps(used: int) -> str:
 def test_a_texture_is_looked_up_by_the_coordinates_that_its_material_names(tmp_path: Path) -> None:
     file = tmp_path / "square.gltf"
     file.write_text(two_maps(1))
-    asset = import_object(file)
+    asset = import_object(file, facing="+x")
     left = asset.mesh.vertices[:, 0] < 0.0
     inside = (asset.mesh.uvs * 0.8 + 0.1).astype(np.float64)
     assert sampled(asset.base_color, inside[left]).mean() < 0.2

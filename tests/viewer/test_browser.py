@@ -291,7 +291,7 @@ def test_the_boxes_of_a_detector_lie_on_its_pictures(browser: Browser, tmp_path:
     found = [{"box": [1.0, 1.0, 5.0, 6.0], "label": "bowl", "score": 0.9}]
     found += [{"box": [4.0, 4.5, 12.0, 12.0], "label": "mug", "score": 0.4}]
     payload: Any = {"box": [4, 4, 12, 12], "found": found}
-    run = make_sweep(tmp_path / "boxes", keep="all", payload=payload, label="no mug", task="detection")
+    run = make_sweep(tmp_path / "boxes", keep="all", payload=payload, label="mug", task="detection")
     with opened(browser, (run / "report.html").as_uri()) as page:
         page.wait_for_selector(".card svg")
         page.get_by_label("Show", exact=True).select_option("right")
@@ -301,7 +301,7 @@ def test_the_boxes_of_a_detector_lie_on_its_pictures(browser: Browser, tmp_path:
         image, drawing = page.locator(".card img").first.bounding_box(), page.locator(".card svg").first.bounding_box()
         assert image == drawing
         card = page.locator(".card").first
-        until(page, lambda: "no mug found (best score of mug 0.90)" in card.inner_text())
+        until(page, lambda: "mug (score 0.90)" in card.inner_text())
         page.get_by_label("Show", exact=True).select_option("wrong")  # "cup", which is none of those that were found
         assert page.locator(".card rect.said").count() == 0 and page.locator(".card rect.true").count() == 6
 
