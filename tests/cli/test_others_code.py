@@ -193,7 +193,7 @@ PYTHON: dict[str, Callable[[], object]] = {
     "a thread": lambda: Photographs().add(Path("runs/kept"), "0", photograph()),
     "a worker": in_a_worker,
     "a worker of a study": lambda: attacks_of(
-        {"command": "attack", **AttackConfig(object="mug,bowl", model=NAME, controls={"pose": {}}).plain()}
+        AttackConfig(object="mug,bowl", model=NAME, controls={"pose": {}}).plain()
     )([0]),
 }
 
