@@ -5,6 +5,7 @@ Nothing is imported before it is needed. A part whose module is missing is left 
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.util import find_spec
 from typing import NamedTuple
 
@@ -91,6 +92,7 @@ def is_present(module: str) -> bool:
         return False
 
 
+@cache
 def list_built_ins(kind: str) -> dict[str, BuiltIn]:
     """Return the built-in parts of one kind by name, without those whose module is missing."""
     parts = (part for part in BUILT_INS if part.kind == kind)
