@@ -27,7 +27,7 @@ from advsearch.scene.importing.files import SPLATS, check_faces
 from advsearch.scene.importing.geometry import triangulated
 from advsearch.scene.importing.gltf import DEEPEST_TREE, LARGEST_TREE
 from advsearch.scene.importing.usd_layers import check_layers, unpacked
-from advsearch.scene.importing.usd_surface import FIRST, Bound, Layout, PrimvarUse, Surfaces
+from advsearch.scene.importing.usd_surface import FIRST, BoundMaterial, Layout, PrimvarUse, UsdSurfaces
 from advsearch.trust.stored_files import check_most
 
 MOST_TINTS = 16  # colours and opacities of faces that are materials of their own; of more, colours are of vertices
@@ -68,7 +68,7 @@ class Conversion:
         self.header: dict[str, Any] = {name: [] for name in ("nodes", "meshes", "materials", "textures", "images")}
         self.header |= {"samplers": [], "cameras": [], "asset": {"version": "2.0", "generator": GENERATOR}}
         self.lights: list[dict[str, Any]] = []
-        self._surfaces = Surfaces(self.folder, self.header, self.buffer, self.left, self.read)
+        self._surfaces = UsdSurfaces(self.folder, self.header, self.buffer, self.left, self.read)
         self._skins = UsdSkel.Cache()
         for prim in self._prims():
             if prim.IsA(UsdSkel.Root):
@@ -287,7 +287,7 @@ class Conversion:
         return np.stack([moved[:, 0], 1.0 - moved[:, 1]], axis=1), values[1]
 
     def _tinted(
-        self, bound: Bound, primvars: Any, faces: Array, counts: Array, corners: Array
+        self, bound: BoundMaterial, primvars: Any, faces: Array, counts: Array, corners: Array
     ) -> Iterator[tuple[int, tuple[Array, str] | None, Array]]:
         """Yield materials, vertex colours and faces: by the primvars that a surface takes colour and opacity from."""
         if bound.color is None and bound.opacity is None:
@@ -334,7 +334,7 @@ class Conversion:
             number = self._surfaces.tinted(bound, color, None if key[3] < 0.0 else key[3])
             yield number, vertex_colors, faces[chosen]
 
-    def _groups(self, prim: Any, mesh: Any, faces: int) -> Iterator[tuple[Bound, Array]]:
+    def _groups(self, prim: Any, mesh: Any, faces: int) -> Iterator[tuple[BoundMaterial, Array]]:
         """Yield the materials of a mesh and their faces."""
         subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
         rest = np.ones(faces, bool)

@@ -87,7 +87,7 @@ class PrimvarUse:
 
 
 @dataclass(frozen=True)
-class Bound:
+class BoundMaterial:
     """The material of some faces."""
 
     number: int  # of the glTF material
@@ -148,7 +148,7 @@ class Shader:
 
 
 @dataclass(frozen=True, eq=False)
-class TextureUse:
+class UsdTextureUse:
     """A picture that an input shows."""
 
     path: str  # what the file calls it
@@ -171,7 +171,7 @@ class TextureUse:
 
 
 @dataclass
-class Surfaces:
+class UsdSurfaces:
     """Writes the materials of a stage, whose files lie in a folder, into the header of a glTF file."""
 
     folder: Path
@@ -179,13 +179,13 @@ class Surfaces:
     buffer: GlbBuffer
     left: Counter[str]  # sentences about what is left out
     read: list[str]  # files that were read
-    _bound: dict[str, Bound] = field(default_factory=dict)
+    _bound: dict[str, BoundMaterial] = field(default_factory=dict)
     _texels: dict[tuple[bytes, bool], Array] = field(default_factory=dict)
 
     def leave(self, what: str) -> None:
         self.left[what] += 1
 
-    def bound_to(self, prim: Any) -> Bound:
+    def bound_to(self, prim: Any) -> BoundMaterial:
         """Return what a prim is made of: a material, or its display colour."""
         binding = UsdShade.MaterialBindingAPI(prim)
         material = binding.ComputeBoundMaterial(UsdShade.Tokens.preview)[0] or binding.ComputeBoundMaterial()[0]
@@ -194,17 +194,17 @@ class Surfaces:
             self._bound[path] = self._convert(material) if material else self._without_material()
         return self._bound[path]
 
-    def _without_material(self) -> Bound:
+    def _without_material(self) -> BoundMaterial:
         surface = {"baseColorFactor": [*GREY, 1.0], "metallicFactor": 0.0, "roughnessFactor": ROUGHNESS}
         number = self._add_material({"name": "displayColor", "pbrMetallicRoughness": surface})
         color = PrimvarUse("displayColor", GREY)
-        return Bound(number, color=color, opacity=PrimvarUse("displayOpacity", (1.0,)), is_default=True)
+        return BoundMaterial(number, color=color, opacity=PrimvarUse("displayOpacity", (1.0,)), is_default=True)
 
     def _add_material(self, entry: dict[str, Any]) -> int:
         self.header["materials"].append({**entry, "doubleSided": True})
         return len(self.header["materials"]) - 1
 
-    def tinted(self, bound: Bound, color: Sequence[float] | None, opacity: float | None) -> int:
+    def tinted(self, bound: BoundMaterial, color: Sequence[float] | None, opacity: float | None) -> int:
         """Return the number of a material with another colour and opacity, linear values in [0, 1]."""
         entry = dict(self.header["materials"][bound.number])
         surface = dict(entry["pbrMetallicRoughness"])
@@ -218,7 +218,7 @@ class Surfaces:
             entry["alphaMode"] = "BLEND"
         return self._numbered("materials", entry)
 
-    def _convert(self, material: Any) -> Bound:
+    def _convert(self, material: Any) -> BoundMaterial:
         name = str(material.GetPrim().GetName())
         self._texels.clear()  # they take memory
         shader = material.ComputeSurfaceSource()[0]
@@ -226,7 +226,7 @@ class Surfaces:
             self.leave("has a material that is no UsdPreviewSurface, which is grey here")
             grey = [0.2140, 0.2140, 0.2140, 1.0]
             surface = {"baseColorFactor": grey, "metallicFactor": 0.0, "roughnessFactor": ROUGHNESS}
-            return Bound(self._add_material({"name": name, "pbrMetallicRoughness": surface}))
+            return BoundMaterial(self._add_material({"name": name, "pbrMetallicRoughness": surface}))
         return PreviewSurface(self, Shader.of(shader), name).convert()
 
     # ---- pictures ----------------------------------------------------------------------------------------------------
@@ -256,7 +256,7 @@ class Surfaces:
         self.read.append(outer)
         return data
 
-    def texels(self, use: TextureUse) -> Array | None:
+    def texels(self, use: UsdTextureUse) -> Array | None:
         """Return a picture (H, W, 4) in linear values, before scale and bias; None, and a note, of none."""
         key = (use.data, use.is_srgb)
         if key not in self._texels:
@@ -267,7 +267,7 @@ class Surfaces:
                 return None
         return self._texels[key]
 
-    def values(self, use: TextureUse) -> Array | None:
+    def values(self, use: UsdTextureUse) -> Array | None:
         """Return what a picture yields, (H, W, C) for its channels."""
         texels = self.texels(use)
         if texels is None:
@@ -296,13 +296,13 @@ class Surfaces:
 class PreviewSurface:
     """Makes a glTF material of a preview surface."""
 
-    surfaces: Surfaces
+    surfaces: UsdSurfaces
     shader: Shader
     name: str
     layouts: list[Layout] = field(default_factory=list)
     nodes: dict[str, Shader] = field(default_factory=dict)  # shaders that are read, by their paths
 
-    def convert(self) -> Bound:
+    def convert(self) -> BoundMaterial:
         """Write the material, and name the inputs that are not read."""
         shader = self.shader
         is_specular = bool(shader.number("useSpecularWorkflow", 0.0))
@@ -319,7 +319,7 @@ class PreviewSurface:
             self.surfaces.leave("has materials with opacityMode transparent; here highlights fade with the opacity too")
         self._name_unread(is_specular=is_specular)
         number = self.surfaces._add_material(entry)
-        return Bound(number, tuple(self.layouts) or (Layout(),), color, opacity)
+        return BoundMaterial(number, tuple(self.layouts) or (Layout(),), color, opacity)
 
     def _name_unread(self, *, is_specular: bool) -> None:
         def is_quiet(name: str, given: Any) -> bool:
@@ -356,7 +356,7 @@ class PreviewSurface:
         primvar = str(reader.value("varname") or "")
         return PrimvarUse(primvar, reader.numbers("fallback", [0.0] * len(otherwise)))
 
-    def _texture(self, name: str) -> TextureUse | tuple[float, ...] | None:
+    def _texture(self, name: str) -> UsdTextureUse | tuple[float, ...] | None:
         """Return the picture that an input shows, or the four numbers in its place; None where it shows none."""
         source = self.shader.source(name)
         if source is None:
@@ -391,7 +391,7 @@ class PreviewSurface:
         if space not in ("auto", "raw", "sRGB"):
             leave(f"has a texture with the sourceColorSpace {space[:50]!r}, which is taken for auto")
         is_srgb = space == "sRGB" or (space != "raw" and is_marked_srgb(data))
-        return TextureUse(path, data, is_srgb, channels, scale, bias, layout, wraps)
+        return UsdTextureUse(path, data, is_srgb, channels, scale, bias, layout, wraps)
 
     def _wraps(self, node: Shader) -> tuple[int, int]:
         wraps = []
@@ -472,7 +472,7 @@ class PreviewSurface:
             entry.update(masked if threshold > 0.0 else {"alphaMode": "BLEND"})
         return color_primvar, opacity_primvar
 
-    def _baked(self, shown: TextureUse | None, cut: TextureUse | None, color: Sequence[float]) -> Array | None:
+    def _baked(self, shown: UsdTextureUse | None, cut: UsdTextureUse | None, color: Sequence[float]) -> Array | None:
         """Return display values (H, W, 3 or 4) of colour and opacity; None where neither picture can be read."""
         colors = None if shown is None else self.surfaces.values(shown)
         shares = None if cut is None else self.surfaces.values(cut)
@@ -494,7 +494,7 @@ class PreviewSurface:
         shader = self.shader
         factors = {"roughness": shader.number("roughness", ROUGHNESS), "metallic": shader.number("metallic", 0.0)}
         planes: dict[str, Array] = {}
-        first: TextureUse | None = None
+        first: UsdTextureUse | None = None
         for name in factors:
             primvar = self._primvar(name, (READER_OF_NUMBERS,), (0.0,))
             use = None if primvar is not None else self._texture(name)
@@ -528,7 +528,7 @@ class PreviewSurface:
         slot = self._slot(texture, first.layout)
         surface.update({"metallicFactor": 1.0, "roughnessFactor": 1.0, "metallicRoughnessTexture": slot})
 
-    def _name_srgb(self, name: str, use: TextureUse) -> None:
+    def _name_srgb(self, name: str, use: UsdTextureUse) -> None:
         if use.is_srgb and use.channels != CHANNELS["a"]:
             self.surfaces.leave(
                 f"has a {name} that is decoded from sRGB, as its sourceColorSpace says; write raw if it holds numbers"
@@ -598,13 +598,13 @@ def _transform_of(node: Shader) -> Array:
     return matrix
 
 
-def _is_factor(use: TextureUse, most: float = 1.0) -> bool:
+def _is_factor(use: UsdTextureUse, most: float = 1.0) -> bool:
     """Whether the colours of a picture are its texels in sRGB, times a factor."""
     is_color = use.is_srgb and len(use.channels) == 3 and use.bias[:3] == NO_BIAS[:3]
     return is_color and has_colors_of_8_bits(use.data) and all(0.0 <= scale <= most for scale in use.scale[:3])
 
 
-def _is_its_alpha(cut: TextureUse, shown: TextureUse) -> bool:
+def _is_its_alpha(cut: UsdTextureUse, shown: UsdTextureUse) -> bool:
     """Whether an opacity is the alpha of the picture of the colour."""
     is_alpha = cut.channels == CHANNELS["a"] and cut.scale[3] == 1.0 and cut.bias[3] == 0.0
     return is_alpha and cut.data == shown.data
