@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
+from advsearch.catalog import list_built_ins
+
 JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None  # whatever JSON can hold
 JsonObject = dict[str, JsonValue]  # A JSON object, before a type has taken it or once it has been written out
-MESHES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".vrm", ".blend", ".usd", ".usda", ".usdc", ".usdz")
-"""Endings of the files that an object can be read from."""
+MESHES = tuple(f".{name}" for name in (*list_built_ins("reader"), *list_built_ins("converter")))
+"""Endings of the files that an object can be read from, but for those of other packages' readers."""
 
 
 def either(names: Sequence[str], word: str = "or") -> str:

@@ -14,7 +14,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, Generic, TypeVar
 
-from advsearch.catalog import list_built_ins
+from advsearch.catalog import BuiltIn, list_built_ins
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.trust.code import check_import, current_directory_importable
 
@@ -26,7 +26,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     """Entries by name: our own first, in the order given, then those of installed packages; ours win a name."""
 
     group: str  # of entry points: "advsearch.policies"
-    own: Mapping[str, Entry | str]  # our entries; one given as text, "module:attribute", is imported when asked for
+    own: Mapping[str, Entry | BuiltIn]  # our entries; one of the catalog is imported when it is asked for
     expected: str  # what an entry is, for messages: "a subclass of Policy whose name is that of the entry point"
     fits: Callable[[str, Any], bool]  # whether an object under a name is one
     # whether the name "package.module:Class", of something that nobody has registered, is one too: a class with a
@@ -38,7 +38,7 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         must not be imported (`check_import`)."""
         if not self.names_class(name):
             own = self.own[name] if name in self.own else self._installed[name]
-            entry: Entry = imported(own) if isinstance(own, str) else own
+            entry: Entry = imported(own.target) if isinstance(own, BuiltIn) else own
             return entry
         check_import(name)
         try:
@@ -65,6 +65,13 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
+    def get_help(self, name: str) -> str:
+        """Return what an entry is, in a sentence: of the catalog, or of another one the docstring's first line."""
+        own = self.own.get(name)
+        if isinstance(own, BuiltIn):
+            return f"{own.help[0].upper()}{own.help[1:]}."
+        return get_first_doc_line(self[name])
+
     def names_class(self, name: str) -> bool:
         """Whether a name is that of a class to import, and not of an instance of a registered entry ("light:Key")."""
         module, colon, attribute = name.partition(":")
@@ -89,15 +96,31 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return entries
 
 
+def get_first_doc_line(entry: Any) -> str:
+    """Return the first line of what an object says of itself; empty for plain values."""
+    documented = entry if inspect.isroutine(entry) or inspect.isclass(entry) else type(entry)
+    if documented.__module__ == "builtins":
+        return str(entry) if isinstance(entry, str) else ""
+    return (inspect.getdoc(documented) or "").partition("\n")[0]
+
+
 def imported(place: str) -> Any:
     """Return what "module:attribute" names."""
     module, _, attribute = place.partition(":")
     return getattr(import_module(module), attribute)
 
 
+def get_class(kind: str, name: str) -> Any:
+    """Return the class of a built-in part by its own name, which is imported. Raises AttributeError: there is none."""
+    for part in list_built_ins(kind).values():
+        if part.target.endswith(f":{name}"):
+            return imported(part.target)
+    raise AttributeError(f"there is no {kind} with a class {name}")
+
+
 EXPERIMENTS: Registry[Any] = Registry(
     "advsearch.experiments",
-    {name: part.target for name, part in list_built_ins("experiment").items()},
+    list_built_ins("experiment"),
     "an `advsearch.experiment.Experiment` whose command is the name of the entry point",
     lambda name, entry: getattr(getattr(entry, "settings", None), "command", None) == name,
 )
@@ -113,8 +136,8 @@ def get_experiment(name: str) -> Any:
 
 def get_experiment_help(name: str) -> str:
     """Return what an experiment does, in a line: of the catalog, or of an installed one the docstring's first line."""
-    built_in = list_built_ins("experiment").get(name)
-    if built_in is not None:
+    built_in = EXPERIMENTS.own.get(name)
+    if isinstance(built_in, BuiltIn):
         return built_in.help
     summary = (inspect.getdoc(get_experiment(name).function) or "").partition("\n")[0].rstrip(".")
     return summary[:1].lower() + summary[1:]

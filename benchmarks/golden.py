@@ -293,7 +293,9 @@ def answer(command: Sequence[str], run: str) -> dict[str, Any]:
     said = written([command[0], *(shared[2:] if twice else shared), *command[1:], *where, "--json"])
     found: dict[str, Any] = {"answer": json.loads(said) if said.strip() else None}
     if command[0] in ("attack", "sweep"):
-        found["rows"] = list(csv.DictReader(io.StringIO(written(["export", run]))))
+        parts = sorted(Path(run, "parts").glob("*")) or [Path(run)]  # the rows of a study are those of its parts
+        exported = [written(["export", str(part)]) for part in parts]
+        found["rows"] = [row for text in exported for row in csv.DictReader(io.StringIO(text))]
     if command[0] == "render":
         found["digest"] = hashlib.sha256(imageio.imread("picture.png").tobytes()).hexdigest()
     return found

@@ -33,7 +33,7 @@ from typing import Any
 import torch
 
 from advsearch import seeds
-from advsearch.controls import CONTROLS, OWN, make_space
+from advsearch.controls import CONTROLS, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.acceptance import CHECK_SPP, levels_off
 from advsearch.engine.gradients import inside, smooth_loss
@@ -114,7 +114,7 @@ def battery() -> int:
         cases += [({f"{family}.{one.name}": end}, {}) for one in some for end in ends(one)]
     names = [f"material.{one.name}" for one in MATERIAL]
     cases += [(dict(zip(names, each, strict=True)), {}) for each in itertools.product((0.0, 1.0), repeat=len(names))]
-    for kind in sorted(OWN):
+    for kind in sorted(CONTROLS.own):
         parameters = [one for one in CONTROLS[kind].parameters if f"{kind}.{one.name}" not in SETTINGS]
         cases += [({}, {kind: {one.name: end}}) for one in parameters if not one.shape for end in ends(one)]
     worst, asked = 0.0, 0

@@ -19,7 +19,8 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch import load_scene
-from advsearch.controls import OWN, make_space
+from advsearch.catalog import list_built_ins
+from advsearch.controls import make_space
 from advsearch.engine.loading import as_controls, make_renderer
 from advsearch.scene.formation import to_8_bit
 
@@ -34,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", type=int, default=144, help="side of one picture (default 144)")
     args = parser.parse_args(argv)
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for name in args.names or OWN:
+    for name in args.names or list_built_ins("control"):
         path = FOLDER / f"{name}.png"
         row(name, args.size).save(path, optimize=True)
         print(f"written: {path.relative_to(FOLDER.parent.parent.parent)}", file=sys.stderr)

@@ -25,7 +25,7 @@ from pydantic.fields import ComputedFieldInfo, FieldInfo
 from advsearch.cli.flags import SCENE, help_text
 from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS
-from advsearch.controls import OWN
+from advsearch.controls import CONTROLS
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
 from advsearch.questions.compare.result import CompareResult
@@ -217,10 +217,9 @@ def environments(record: Record) -> str:
 
 def controls(record: Record) -> str:
     """Every control with one sentence and its picture; below, in full, those that have no page."""
-    from advsearch.controls import CONTROLS
 
     rows, below = [], ""
-    for kind in OWN:
+    for kind in CONTROLS.own:
         place = f"{kind}.md" if (f"controls/{kind}.md", kind) in PARTS else f"#{kind}"
         drawn = (DOCS / "images" / "controls" / f"{kind}.png").is_file()
         picture = f"![{kind}](../images/controls/{kind}.png)" if drawn else ""
@@ -251,7 +250,6 @@ def control(kind: str) -> Callable[[Record], str]:
     """The parameters and settings that a control declares."""
 
     def make(record: Record) -> str:
-        from advsearch.controls import CONTROLS
 
         declared = CONTROLS[kind]
         parameters = [
@@ -524,7 +522,11 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("scenes.md", "objects"): objects,
     ("scenes.md", "environments"): environments,
     ("controls/README.md", "controls"): controls,
-    **{(f"controls/{kind}.md", kind): control(kind) for kind in OWN if (DOCS / "controls" / f"{kind}.md").is_file()},
+    **{
+        (f"controls/{kind}.md", kind): control(kind)
+        for kind in CONTROLS.own
+        if (DOCS / "controls" / f"{kind}.md").is_file()
+    },
     ("policies/pgd.md", "pgd"): policy("pgd"),
     ("design.md", "endings"): endings,
     ("results.md", "every-result"): every_result,

@@ -31,7 +31,6 @@ from advsearch.attacks import (
     planned_renders,
 )
 from advsearch.attacks.objectives import check_objective
-from advsearch.cli.export import WRITERS
 from advsearch.cli.flags import config_from
 from advsearch.cli.main import _parse
 from advsearch.config import CONFIGS, RenderConfig, SceneConfig
@@ -54,6 +53,7 @@ from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig, read_suite
 from advsearch.runs import export
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.exporters import EXPORTERS
 from advsearch.runs.store import Row
 from advsearch.scene import library
 from advsearch.scene.importing.scenes import MITSUBA_FILE, split_node
@@ -196,7 +196,7 @@ def check_advsearch(words: list[str], folder: Path) -> None:
         config = RecipeConfig if of_a_recipe else SweepConfig if "-sweep-" in run else AttackConfig
         check_names(config.from_yaml(file, dict(parse_assignment(text, text) for text in args.change)))
     if args.command == "export":
-        assert args.format in (None, *WRITERS, *export.FORMATS)
+        assert args.format in (None, *EXPORTERS, *export.FORMATS)
 
 
 def check_other(words: list[str]) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks import Query
-from advsearch.controls import CONTROLS, OWN, compose, make_control, make_space
+from advsearch.controls import CONTROLS, compose, make_control, make_space
 from advsearch.engine.judging import domain_of
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.problem import Problem
@@ -61,7 +61,7 @@ FORMS: dict[str, dict[str, Any]] = {
     "corruption": {"which": ["fog", "jpeg", "gaussian_noise"], "severity": [0, 5]},
     "mitsuba": {"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]},
 }
-FORMS |= {kind: {} for kind in OWN if kind not in FORMS}  # another one varies as it declares itself
+FORMS |= {kind: {} for kind in CONTROLS.own if kind not in FORMS}  # another one varies as it declares itself
 EXCLUSIVE = {frozenset(("sky", "environment")), frozenset(("path", "camera")), frozenset(("geometry", "body"))}
 EXCLUSIVE |= {frozenset(("contents", "body")), frozenset(("material", "body"))}
 """Pairs that set the same input and are refused; nobody is a vessel, and no named material covers a person."""
@@ -110,7 +110,7 @@ def model() -> advsearch.Model:
 
 
 def test_every_control_is_here_and_varies() -> None:
-    assert set(FORMS) == set(OWN), "FORMS of tests/test_pairs.py names a control that there is not"
+    assert set(FORMS) == set(CONTROLS.own), "FORMS of tests/test_pairs.py names a control that there is not"
     for kind, form in FORMS.items():
         varied = compose([make_control(kind, form)], describe(suited([kind]), things=beside([kind]))).start.numel()
         assert varied, f"{kind} has no range: give a parameter `search=(low, high)`, or {kind} a form in FORMS"

@@ -15,6 +15,7 @@ import pytest
 from advsearch import registry
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import POLICIES
+from advsearch.catalog import BuiltIn
 from advsearch.controls import CONTROLS
 from advsearch.errors import InputError
 from advsearch.models.loading import SOURCES
@@ -39,15 +40,16 @@ class Point:
 
 def with_points(monkeypatch: pytest.MonkeyPatch, *points: Point) -> Registry[int]:
     monkeypatch.setattr(registry, "entry_points", lambda group: points if group == "advsearch.numbers" else ())
-    own: dict[str, int | str] = {"one": 1, "mod": "sys:maxsize"}
+    own: dict[str, int | BuiltIn] = {"one": 1, "mod": BuiltIn("number", "mod", "sys:maxsize", "the largest index")}
     return Registry("advsearch.numbers", own, "a number", lambda name, entry: isinstance(entry, int))
 
 
-def test_own_entries_come_first_and_win_and_texts_are_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_own_entries_come_first_and_win_and_those_of_the_catalog_are_imported(monkeypatch: pytest.MonkeyPatch) -> None:
     numbers = with_points(monkeypatch, Point("one", 100), Point("two", 2))
     assert list(numbers) == ["one", "mod", "two"] and len(numbers) == 3
     assert (numbers["one"], numbers["mod"], numbers["two"]) == (1, sys.maxsize, 2)
     assert "three" not in numbers
+    assert numbers.get_help("mod") == "The largest index."
 
 
 @pytest.mark.parametrize(

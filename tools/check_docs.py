@@ -29,6 +29,7 @@ from advsearch.attacks.verification import WORST_CASE
 from advsearch.cli.main import list_commands
 from advsearch.cli.show import REGISTRIES
 from advsearch.controls import CONTROLS, texture
+from advsearch.controls.support.norms import DEFAULT_EPSILON
 from advsearch.files import MESHES
 from advsearch.models import loading, reference
 from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
@@ -41,10 +42,12 @@ from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test import counterexamples as tested
 from advsearch.registry import EXPERIMENTS
 from advsearch.runs import directory, export, store
+from advsearch.runs.exporters import EXPORTERS
 from advsearch.runs.results import RenderResult, Result
 from advsearch.scene import formation, library
 from advsearch.scene.geometry import FRAME_FILL
 from advsearch.scene.importing.pictures import TEXTURE_LIMIT
+from advsearch.scene.importing.readers import READERS
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import settings
@@ -288,7 +291,7 @@ MADE_BY_HAND = [
     ("scenes.md", f"gets the linear value {formation.METERED_WHITE}"),
     ("scenes.md", f"averaged down to at most {TEXTURE_LIMIT} texels"),
     ("scenes.md", "Maps larger than {1} x {0} are".format(*library.LARGEST)),
-    ("controls/texture.md", f"Default {texture.DEFAULT_EPSILON}"),
+    ("controls/texture.md", f"Default {DEFAULT_EPSILON}"),
     ("controls/texture.md", "at least {} and at most {}".format(*texture.RESOLUTIONS)),
     ("policies/pgd.md", f"the first after {100 * pgd.FIRST_WINDOW:.0f} % of the steps"),
     ("policies/pgd.md", {0.75: "fewer than three quarters of the steps"}[pgd.IMPROVING]),
@@ -355,7 +358,8 @@ def words() -> Iterator[str]:
 MADE_UP = {"tests/test_architecture.py", "tests/test_docs.py", "tests/test_registry.py"}
 """Tests of such rules, which name modules that are not there."""
 NAME = re.compile(r"(?<![\w./-])`?(advsearch(?:\.[A-Za-z_]\w*)+)(?:\(\))?`?(?![\w/-])")
-GROUPS = {registry.group for registry in (CONTROLS, EXPERIMENTS, OBJECTIVE_KINDS, POLICIES, SOURCES_OF_MODELS)}
+REGISTERED = (CONTROLS, EXPERIMENTS, EXPORTERS, OBJECTIVE_KINDS, POLICIES, READERS, SOURCES_OF_MODELS)
+GROUPS = {registry.group for registry in REGISTERED}
 """Groups of entry points, which are names and no modules."""
 PATH = re.compile(rf"(?<![\w./-])((?:{'|'.join(FOLDERS)})/[\w./-]*\w\.(?:py|md|sh|json|png))")
 PLACEHOLDER = re.compile(r"\b[A-Z]{4,}\.")

@@ -15,15 +15,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw
 from scipy import ndimage
 from torch import Tensor
 
 import advsearch
 from advsearch import seeds
-from advsearch.controls.patch import enlarged
-from advsearch.controls.projector import ProjectorControl
 from advsearch.controls.space import file_name
+from advsearch.controls.support.images import enlarged
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.loading import Scene, as_controls, load_scene
 from advsearch.engine.problem import Problem
@@ -34,10 +32,9 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import attack_of
 from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
-from advsearch.runs.files import read_png, to_8bit, write_png
+from advsearch.runs.files import read_png, to_8bit
 from advsearch.scene.assembly import ON_PICTURE, posed
 from advsearch.scene.assets import Floats, Ints, Mesh
-from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import NO_MAP, OBJECT
 from advsearch.scene.glb import PLAIN, glb
 from advsearch.scene.mitsuba_backend.writing import NAME, SCATTERINGS, write_scene
@@ -256,89 +253,3 @@ def _piece(name: str, picture: Floats, pixel: tuple[float, float], inside: Mask 
     if inside is not None and not inside.all():
         mask = np.pad(inside.repeat(parts, 0).repeat(parts, 1), ((rows, rows), (columns, columns)))
     return Piece(name, levels, size, (columns, rows), mask)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# What a projector needs to throw the picture of a run's adversarial scene: the picture, marks to line it up by, and
-# what to set.
-
-ROWS = 1024  # least height of the pictures to project, in pixels
-SHARES = (1 / 8, 1 / 2, 7 / 8)  # where the nine marks are in a picture, of its width and height
-SPP = 64  # samples a pixel of the picture of the scene with the marks
-
-
-def write_projection(run: str | Path, out: Path) -> list[str]:
-    """Write a folder for each projector of a run's adversarial scene: `picture.png` to project, `texels.png` with the
-    exact values, `marks.png` to project first, `seen.png`, where the run's camera sees these marks, and `README.txt`;
-    return sentences about what to set. Raises errors as `adversarial_of`, and InputError where it has no projector, or
-    the folder is there already."""
-    if os.path.lexists(out):
-        raise InputError(f"out: {out} is there already; choose another name")
-    adversarial = adversarial_of(run)
-    slices = adversarial.problem.space.slices(adversarial.u)
-    projectors = [(one, part) for one, part in slices if isinstance(one, ProjectorControl)]
-    if not projectors:
-        raise InputError(f"{adversarial.folder}: it has no projector, so that there is nothing to project")
-    notes: list[str] = []
-    with placed_by("out"), storage_errors(out):
-        for control, part in projectors:
-            folder = out / file_name(control.name) if len(projectors) > 1 else out
-            folder.mkdir(parents=True)
-            values = control.values(part)
-            pattern = values["pattern"]
-            factor = -(-ROWS // len(pattern))
-            marks, places = marked((len(pattern), pattern.shape[1]), factor)
-            small = torch.nn.functional.avg_pool2d(marks.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0)
-            write_png(folder / "picture.png", enlarged(pattern, factor))
-            write_png(folder / "texels.png", pattern)
-            write_png(folder / "marks.png", linear_to_srgb(marks))
-            renderer, inputs = adversarial.problem.renderer, adversarial.inputs
-            inputs |= control.scene_inputs({**values, "pattern": linear_to_srgb(small)}, {})
-            traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
-            seed = seeds.stream(adversarial.problem.seed, "marks")
-            with torch.no_grad():
-                rendered = renderer.rendered(traced, seed, SPP, "backdrop.color" in inputs)
-                write_png(folder / "seen.png", renderer.finished(rendered, inputs, adversarial.u))
-            number = {name: float(value) for name, value in values.items() if value.ndim == 0}
-            unit = "m" if control.scene.object.metres is not None else "object sizes"
-            fov, aspect, white = control.part.fov, control.part.aspect, control.measured(values, {})["white"]["value"]
-            half = math.tan(math.radians(fov) / 2.0)
-            settings = [
-                f"{number['lumens']:g} lumens for a white picture, {number['distance']:.3g} {unit} from the object's "
-                "middle",
-                f"a picture {fov:.3g} degrees wide (throw ratio {0.5 / half:.2f}), {aspect:.3g} times as wide as high",
-                f"azimuth {number['azimuth'] % 360.0:.4g} and elevation {number['elevation']:.4g} degrees around the "
-                "object",
-                f"ambient light of {number['ambient']:.4g} lux; white is {white:.4g} lux on the object",
-            ]
-            where = []
-            for mark, (row, column, x, y) in enumerate(places, 1):
-                right, up = (math.degrees(math.atan(at)) for at in ((2 * x - 1) * half, (1 - 2 * y) * half / aspect))
-                at = f"{mark}: row {row}, column {column}"
-                where.append(f"{at}; {right:.2f} degrees to the right of the middle, {up:.2f} up")
-            text = ["Set:", *settings, "", "Marks of marks.png, by texel from the upper left:", *where, ""]
-            write_text(folder / "README.txt", "\n".join(text), durable=False)
-            notes += settings
-    return notes
-
-
-def marked(sides: tuple[int, int], factor: int) -> tuple[Tensor, list[tuple[int, int, float, float]]]:
-    """Return a picture of a frame and nine numbered crosses on black, (h, w, 3) linear in [0, 1], so many times as
-    large as a pattern of `sides` rows and columns, and of each cross row and column of its texel and their middle as
-    shares of the picture's width and height."""
-    height, width = sides[0] * factor, sides[1] * factor
-    picture = Image.new("L", (width, height))
-    draw = ImageDraw.Draw(picture)
-    line, arm = max(2, height // 200), height // 24
-    draw.rectangle((0, 0, width - 1, height - 1), outline=255, width=2 * line)
-    places = []
-    for down in SHARES:
-        for across in SHARES:
-            row, column = int(down * sides[0]), int(across * sides[1])
-            x, y = (column + 0.5) * factor, (row + 0.5) * factor
-            draw.line((x - arm, y, x + arm, y), fill=255, width=line)
-            draw.line((x, y - arm, x, y + arm), fill=255, width=line)
-            places.append((row, column, (column + 0.5) / sides[1], (row + 0.5) / sides[0]))
-            draw.text((x + line, y + line), str(len(places)), fill=255, font_size=arm)
-    levels = torch.frombuffer(bytearray(picture.tobytes()), dtype=torch.uint8).reshape(height, width, 1)
-    return levels.expand(-1, -1, 3) / 255.0, places

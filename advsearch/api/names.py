@@ -4,11 +4,12 @@ once. What this module lets through is looked up again by whoever loads it."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+from advsearch.catalog import list_built_ins
 from advsearch.errors import InputError, UnknownNameError, resembling
 from advsearch.runs.directory import find_run
 from advsearch.scene.library import MAP_HINT, OBJECT_HINT, list_environments, list_objects
@@ -17,27 +18,10 @@ from advsearch.settings import Config, split_names
 WORD = re.compile(r"[^\W\d][\w-]{0,59}")  # what can only be the name of something bundled: no path, no file, no code
 LABEL_SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco90", "coco91", "voc")
 """`advsearch.models.labels.SETS`, which a test holds this to."""
-PACKAGE = Path(__file__).parent.parent
-
-
-def own_names(kind: str) -> list[str]:
-    """Return the names of the package's own "control"s, "policy"s or "task"s, read from their files without an import.
-    Tests hold them to the registries."""
-    if kind == "control":
-        named = {path.stem if path.stem != "__init__" else path.parent.name: path for path in _files("controls")}
-        return [name for name, path in named.items() if f"class {name.title().replace('_', '')}Control(" in _text(path)]
-    folder = {"policy": "attacks/policies", "task": "tasks"}[kind]
-    found = re.findall(r'^    name(?:: ClassVar\[str\])? = "(\w+)"$', "\n".join(map(_text, _files(folder))), re.M)
-    return [name for name in found if name not in ("choices", "own", "ensemble")]  # nobody asks for these
-
-
-def _files(folder: str) -> Iterator[Path]:
-    yield from sorted((PACKAGE / folder).glob("*.py"))
-    yield from sorted((PACKAGE / folder).glob("*/__init__.py"))
-
-
-def _text(path: Path) -> str:
-    return path.read_text(encoding="utf-8")
+PARAMETERS = frozenset(
+    "aberration aperture exposure heading height lumens phase pitch power pushes shot texels water weight x y z".split()
+)
+"""Names of controls' parameters that are like the name of a control, which a test holds this to."""
 
 
 def check_names(config: Config) -> None:
@@ -53,9 +37,11 @@ def check_names(config: Config) -> None:
     _check("environment", [one for one in environments if one != "none"], list_environments(), MAP_HINT)
     controls = {**(said.get("controls") or {}), **(said.get("over") or {})}
     kinds = [str((own or {}).get("kind") or name) for name, own in controls.items()]
-    texts = "".join(map(_text, (*_files("controls"), PACKAGE / "scene" / "settings.py")))
-    kinds = [kind for kind in kinds if f'"{kind}"' not in texts]  # of a parameter the registry says whose it is
-    _check("control", [re.split(r"[:.]", kind)[0] for kind in kinds if not re.search(r":[A-Z]", kind)], "controls")
+    names = [re.split(r"[:.]", kind)[0] for kind in kinds if not re.search(r":[A-Z]", kind)]
+    built_in_controls = list_built_ins("control")
+    # of a parameter the registry says whose it is
+    slips = [name for name in names if name not in PARAMETERS and resembling(name, built_in_controls)]
+    _check("control", slips, "controls")
     for setting, group in (("policy", "policies"), ("task", "tasks")):
         given = said.get(setting)
         name = str(given.get("name", "")) if isinstance(given, Mapping) else str(given or "")
@@ -90,6 +76,6 @@ def _check(kind: str, names: Iterable[str], known: Iterable[str], hint: str = ""
         if not WORD.fullmatch(name) or Path(name).exists():
             continue
         if isinstance(known, str):
-            known = [*own_names(kind), *(point.name for point in entry_points(group=f"advsearch.{known}"))]
+            known = [*list_built_ins(kind), *(point.name for point in entry_points(group=f"advsearch.{known}"))]
         if name not in (known := list(known)):
             raise UnknownNameError(kind, name, known, hint)

@@ -31,10 +31,9 @@ from advsearch.attacks.objective_functions import margin as margin  # for object
 from advsearch.copies import copied
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import told
-from advsearch.registry import Registry
-from advsearch.tasks import TASKS, Classification, Depth, Segmentation, Similarity, Task
+from advsearch.registry import Registry, imported
+from advsearch.tasks import TASKS, Classification, Task
 from advsearch.tasks.classification import ClassTask
-from advsearch.tasks.depth import GOALS as DEPTH_GOALS
 from advsearch.tasks.detection import GOALS, Detection
 from advsearch.tasks.together import Together
 
@@ -263,6 +262,7 @@ def _score_of(task: Task) -> Objective:
     return _plain(lambda output, images, truth: task.score(output, truth))
 
 
+_DEPTH_GOALS: Mapping[str, str] = imported("advsearch.tasks.depth:GOALS") if "depth" in TASKS.own else {}
 _OWN = {
     kind.name: kind
     for kind in (
@@ -281,7 +281,7 @@ _OWN = {
         ),
         ObjectiveKind(
             "distance", "how far the features lie from those of the clean picture, by the angle", "1 - cosine",
-            task=Similarity.name, of_features=functions.cosine_distance,
+            task="similarity", of_features=functions.cosine_distance,
         ),
         ObjectiveKind(
             "score", "the task's own score, over 0 where a prediction is a success; in classification the margin loss",
@@ -296,15 +296,16 @@ _OWN = {
             "those of the tasks", task=Together.name, of_task=_score_of,
         ),
         *(
-            ObjectiveKind(name, f"success: {summary}", "logarithm of a factor", task=Depth.name, of_task=_score_of)
-            for name, summary in DEPTH_GOALS.items()
+            ObjectiveKind(name, f"success: {summary}", "logarithm of a factor", task="depth", of_task=_score_of)
+            for name, summary in _DEPTH_GOALS.items()
         ),
         ObjectiveKind(
             "pixel_margin", "the largest wrong logit minus the largest right one, mean over the object's pixels",
-            "logits (log-odds)", task=Segmentation.name,
+            "logits (log-odds)", task="segmentation",
             of_task=lambda task: _plain(lambda output, images, truth: task.pixel_margin(output, truth)),
         ),
     )
+    if kind.task in (None, Together.name, *TASKS.own)
 }  # fmt: skip
 
 OBJECTIVE_KINDS: Registry[ObjectiveKind] = Registry(
@@ -370,7 +371,8 @@ def get_objective(
     else:
         form = kind.form(targeted=targeted)
         function = _plain(form) if ours else checked(form)
-        by_task = isinstance(task, Similarity) or (isinstance(task, ClassTask) and bool(task.nothing))
+        compares_features = isinstance(task, Classification) and not task.reads_logits
+        by_task = compares_features or (isinstance(task, ClassTask) and bool(task.nothing))
     looks = kind is None and targeted
 
     def sought(output: Any, images: Tensor, truth: Any, more: More = nothing_more, /) -> Tensor:

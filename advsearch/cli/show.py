@@ -6,7 +6,6 @@ And what `advsearch render` says: a picture of a scene, or a sheet of views arou
 from __future__ import annotations
 
 import argparse
-import inspect
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -21,7 +20,7 @@ from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
-from advsearch.registry import imported
+from advsearch.registry import Registry, get_first_doc_line, imported
 from advsearch.report.wording import count, interval_text
 from advsearch.runs.directory import IMAGES, find_run
 from advsearch.runs.listing import Listed, listed_run
@@ -152,7 +151,7 @@ def _show_declared(kind: str, name: str, as_json: bool) -> int:
         facts["options"], rows = options, [{**option, "default": _cell(option["default"])} for option in options]
         how = f"options, as in --{kind} '{name}={{OPTION: VALUE}}':"
         parts.append(f"{how}\n{_table(rows)}" if rows else "It has no options.")
-    return output.say(as_json, facts, "\n\n".join([f"{name}: {first_doc_line(entry)}", *parts]))
+    return output.say(as_json, facts, "\n\n".join([f"{name}: {get_first_doc_line(entry)}", *parts]))
 
 
 def _of_parameter(parameter: Parameter) -> dict[str, str]:
@@ -267,22 +266,16 @@ MODELS = {"reference": "the bundled classifier of household objects; models of y
 def list_names(kind: str) -> dict[str, str]:
     """Return the names of one kind, each with one line about it where its registry has one."""
     entries = _registry(kind)
+    if isinstance(entries, Registry):
+        return {name: entries.get_help(name) for name in entries}
     if isinstance(entries, Mapping):
-        return {str(name): first_doc_line(entry) for name, entry in entries.items()}
+        return {str(name): get_first_doc_line(entry) for name, entry in entries.items()}
     return {str(name): "" for name in entries}
 
 
 def _registry(kind: str) -> Any:
     registry = imported(REGISTRIES[kind])
     return registry() if callable(registry) else registry
-
-
-def first_doc_line(entry: Any) -> str:
-    """Return the first line of what an entry of a registry says of itself; empty for plain values."""
-    documented = entry if inspect.isroutine(entry) or inspect.isclass(entry) else type(entry)
-    if documented.__module__ == "builtins":
-        return str(entry) if isinstance(entry, str) else ""
-    return (inspect.getdoc(documented) or "").partition("\n")[0]
 
 
 @command(

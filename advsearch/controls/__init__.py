@@ -7,36 +7,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from importlib import import_module
-from pkgutil import iter_modules
 from typing import Any
 
+from advsearch.catalog import list_built_ins
 from advsearch.controls.base import Budget, Choice, Control, Group, Moved, NumberControl, Parameter, check_prepared
 from advsearch.controls.space import Space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import by_key
-from advsearch.registry import Registry
+from advsearch.registry import Registry, get_class
 from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription
-
-ORDER = (
-    "pose camera path texture material light projector spot shadow environment sky geometry things body patch "
-    "occlusion contents background haze lens sensor corruption mitsuba"
-).split()
-"""In which lists have controls; one that is not named comes last."""
-SHARED = ("base", "ranges", "space", "corruption_filters")  # modules of this folder that are no control
-
-
-_kinds = {module.name for module in iter_modules(__path__)} - {*SHARED}
-OWN = {
-    kind: "".join(map(str.capitalize, kind.split("_"))) + "Control"
-    for kind in sorted(_kinds, key=lambda kind: (ORDER.index(kind) if kind in ORDER else len(ORDER), kind))
-}
-"""The package's own controls, one for each other module: the word on the command line is the module's name, and this is
-its class."""
 
 CONTROLS: Registry[type[Control]] = Registry(
     "advsearch.controls",
-    {kind: f"{__name__}.{kind}:{name}" for kind, name in OWN.items()},
+    list_built_ins("control"),
     "a subclass of Control whose kind is the name of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Control) and entry.kind == name != "",
     imports=True,
@@ -215,10 +198,7 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
 
 def __getattr__(name: str) -> Any:
     """Import the class of a control when it is asked for by name: TextureControl, or Texture for short."""
-    for module, class_name in OWN.items():
-        if class_name in (name, f"{name}Control"):
-            return getattr(import_module(f"{__name__}.{module}"), class_name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return get_class("control", name if name.endswith("Control") else f"{name}Control")
 
 
 __all__ = [

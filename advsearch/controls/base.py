@@ -43,6 +43,7 @@ from advsearch.scene.settings import Parameter as Parameter
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+WAY = "way"  # the parameter that says which of several paths is taken
 LARGEST_EPSILON = 1e6  # no distance from where a control starts is larger, in whichever norm
 
 # Where a control leaves out a value of the clean scene that was asked for, the two contradict each other, and that is
@@ -199,6 +200,9 @@ class Control:
         exposure: seconds that the shutter is open, and that the rows of a picture are read in, below 0 from the bottom;
             see `advsearch.scene.formation`.
         flashes: how often a second it changes its light at most.
+        travels: whether it moves something along a path; it has `seconds` and `distances()` then, and its parameter
+            `WAY` says which path is taken where there are several.
+        competes_with_ambient: whether it throws light that ambient light weakens, see `ambient`.
 
     Raises:
         UnknownNameError: no such parameter or choice.
@@ -210,6 +214,8 @@ class Control:
     parameters: ClassVar[tuple[Parameter, ...]]
     choices: ClassVar[tuple[Choice, ...]] = ()
     of_a_mesh: ClassVar[bool] = False
+    travels: ClassVar[bool] = False
+    competes_with_ambient: ClassVar[bool] = False
     amount: ClassVar[str | None] = None
     on_top: bool = False
     name: str
@@ -416,6 +422,15 @@ class Control:
             raise InputError(f"{self.name}.{parameter.name}: it has a ball and no distribution; give it a range")
         name, valid = parameter.name, parameter.estimators
         return Group(name, slot.width, valid, budget, periodic=slot.periodic, setting=setting)
+
+    @property
+    def ambient(self) -> float | None:
+        """Lux of ambient light beside the light that it throws; None where there is none or where that is searched."""
+        return None
+
+    def in_light(self, times: float) -> Self:
+        """Return the bound control in so many times the ambient light."""
+        return self
 
     def later(self, seconds: float) -> Control:
         """Return the bound control as it is so many seconds later, where it knows a time; else itself."""

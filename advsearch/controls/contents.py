@@ -22,7 +22,7 @@ from torch import Tensor
 
 from advsearch.controls.base import Control, Parameter, Value, Values, measure, number
 from advsearch.controls.ranges import Fixed, OneOf, Range, Spec
-from advsearch.controls.shadow import polygon
+from advsearch.controls.support.meshes import polygon
 from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, Ints, Material, Mesh, ObjectAsset
 from advsearch.scene.color import srgb_to_linear

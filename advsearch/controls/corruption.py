@@ -9,19 +9,16 @@ the picture in torch; those by noise, blur, shifted pixels and weather are in `c
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image
 from torch import Tensor
 
 from advsearch.controls import corruption_filters as filters
 from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named, number
-from advsearch.scene.formation import levels_of
+from advsearch.controls.support.images import coded
 
 BRIGHTNESS = ((0.1,), (0.2,), (0.3,), (0.4,), (0.5,))  # added to the value of hue, saturation and value
 CONTRAST = ((0.4,), (0.3,), (0.2,), (0.1,), (0.05,))  # factor on the distance from the mean
@@ -70,24 +67,6 @@ def pixelate(image: Tensor, whole: int) -> Tensor:
 def jpeg(image: Tensor, whole: int) -> Tensor:
     """Save as a JPEG file of the severity's quality and read it again; see `coded`."""
     return coded(image, JPEG[whole - 1])
-
-
-def coded(image: Tensor, quality: int) -> Tensor:
-    """Save as a JPEG file and read it again, chroma subsampled; the derivative is that of the unchanged picture.
-
-    For changes that are smooth over three pixels or more this is within about a third of what the file does with
-    them (measured at qualities of 7 to 25); of finer ones the file keeps less than it says.
-
-    Args:
-        image: (H, W, 3) display-referred sRGB in [0, 1].
-        quality: 1 to 100, as of libjpeg.
-    """
-    levels = levels_of(image.clamp(0.0, 1.0)).cpu().numpy()
-    file = io.BytesIO()
-    Image.fromarray(levels).save(file, "JPEG", quality=quality)
-    with Image.open(file, formats=("JPEG",)) as read:
-        read_back = torch.from_numpy(np.asarray(read, dtype=np.float32) / 255.0)
-    return image + (read_back.to(image.device) - image).detach()
 
 
 SMOOTH: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {

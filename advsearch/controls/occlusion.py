@@ -22,6 +22,8 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Choice, Control, Value, Values, measure, named
+from advsearch.controls.support.meshes import sphere
+from advsearch.controls.support.visibility import SURROUNDINGS, camera_in, put_away
 from advsearch.errors import InputError
 from advsearch.scene import library, silhouettes
 from advsearch.scene.assets import Doubles, Material, Mesh, ObjectAsset, normalised
@@ -41,9 +43,6 @@ OPTIONS = (*MADE, *BUNDLED)
 EASE = 0.02
 """Below this coverage the occluder slides in from outside the frame, so that the picture changes without a jump."""
 CLEARANCE = 0.05  # smallest distance in object sizes between the camera and the occluder
-PARKED = 1e-3  # size of an occluder that is put away, behind the camera
-SURROUNDINGS = ("camera.to_world", "camera.fov", "camera.shift", "camera.lens", "object.to_world", "object.offsets")
-"""Inputs of other controls that an occluder goes by."""
 
 
 @cache
@@ -76,21 +75,6 @@ def made(name: str) -> ObjectAsset:
         return ObjectAsset(name, card, texels.clip(0.0, 1.0).astype(np.float32), Material(roughness=0.9))
     grey = np.full((4, 4, 3), 0.5, dtype=np.float32)
     return ObjectAsset(name, sphere(24, 48), grey, Material(roughness=0.6))
-
-
-def sphere(rows: int, columns: int) -> Mesh:
-    """Return a sphere of diameter 1 around the origin: `rows` bands from pole to pole, 2 (rows - 1) columns faces."""
-    v, u = (
-        one.ravel() for one in np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
-    )
-    theta, phi = math.pi * (1.0 - v), 2.0 * math.pi * u
-    normals = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
-    corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)[None, :]).ravel()
-    above = corner + columns + 1
-    lower, upper = np.stack([corner, corner + 1, above + 1], 1), np.stack([corner, above + 1, above], 1)
-    faces = np.concatenate([lower[columns:], upper[:-columns]])  # without those that are points at the poles
-    vertices, outwards, uvs = (one.astype(np.float32) for one in (0.5 * normals, normals, np.stack([u, v], axis=1)))
-    return Mesh(vertices, faces.astype(np.uint32), outwards, uvs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,13 +300,3 @@ def _matrix(camera: Tensor, placed: Placement, values: Values) -> Tensor:
     linear = placed.size * to_world @ torch.stack([x, y, up], dim=1)
     place = camera[:3, 3] + placed.distance * (to_world @ ahead)
     return affine(linear, place)
-
-
-def camera_in(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> Tensor:
-    """Return the pose (4, 4) of the camera where the controls before have it."""
-    return so_far.get("camera.to_world", torch.from_numpy(camera_to_world(scene)))
-
-
-def put_away(camera: Tensor) -> Tensor:
-    """Return the pose (4, 4) of what is out of sight: tiny, behind the camera of a pose (4, 4)."""
-    return affine(PARKED * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])

@@ -17,8 +17,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -26,74 +24,28 @@ import torch.nn.functional as F
 from scipy import spatial
 from torch import Tensor
 
-from advsearch.controls.base import LARGEST_EPSILON, NOTHING, Choice, Control, Moved, Value, Values, changed, number
-from advsearch.controls.corruption_filters import picture, planes, resized
-from advsearch.controls.ranges import Fixed, OneOf, Range, Slot, Spec
-from advsearch.controls.texture import radius, resampled
-from advsearch.errors import FileFormatError, InputError
+from advsearch.controls.base import LARGEST_EPSILON, Choice, Moved, Values, number
+from advsearch.controls.corruption_filters import planes, resized
+from advsearch.controls.ranges import Fixed, OneOf, Range, Slot
+from advsearch.controls.support.images import PRINT_SIDE, enlarged, resampled
+from advsearch.controls.support.norms import radius
+from advsearch.controls.support.picture_control import PictureControl
+from advsearch.errors import InputError
 from advsearch.scene.assets import Doubles, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.gradients import WHOLE_RANGE, Budget
-from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.raster import MeshSurface, rasterised
 from advsearch.scene.settings import LIT, Parameter
 
 BASE_COLOR = "object.base_color"
 NORMS = ("box", "linf", "l2")
-PRINT_SIDE = 512  # least side of the picture that is kept for printing, in pixels
 BASE_SIDES = (512, 1024)  # smallest and largest side of the base-colour map that is painted into, in texels
 REACH = 0.75
 """Radius around the middle, in sides of the square, within which the surface is painted: its corners are at 0.7071."""
 FACING = (0.1, 0.3)  # cosines between the surface and the square's normal between which it fades in
 EDGE_TEXELS = 2.0  # width of the soft edge in texels
-
-
-class PictureControl(Control):
-    """A control of a picture, searched or from a file, and of numbers, which are fixed where they are not given."""
-
-    shown: ClassVar[str]  # the parameter that is the picture
-    _picture: Tensor | None
-
-    @property
-    def sides(self) -> tuple[int, int]:
-        """Rows and columns of the picture."""
-        return (int(self.chosen["resolution"]),) * 2
-
-    @property
-    def free(self) -> bool:
-        """Whether the picture is searched."""
-        return self.chosen["picture"] is None and not isinstance(self.specs.get(self.shown), Fixed)
-
-    def in_scene(self, parameter: Parameter) -> Parameter:
-        return replace(parameter, shape=(*self.sides, 3), default=0.0) if parameter.name == self.shown else parameter
-
-    def spec(self, parameter: Parameter) -> Spec:
-        picture = Range(0.0, 1.0) if self.free else Fixed(0.0)
-        return self.specs.get(parameter.name, picture if parameter.name == self.shown else Fixed(parameter.default))
-
-    def values(self, u: Tensor) -> dict[str, Tensor]:
-        values, picture = super().values(u), self._picture
-        shown = values[self.shown].reshape(*self.sides, 3) if picture is None else picture.to(u.device, copy=True)
-        return values | {self.shown: shown}
-
-    def read_picture(self) -> Tensor | None:
-        """Return the picture (h, w, 3) sRGB that was chosen; None where none was. Raises FileFormatError: it cannot be
-        read."""
-        if self.chosen["picture"] is None:
-            return None
-        try:
-            return torch.from_numpy(read_picture(Path(self.chosen["picture"])))
-        except FileFormatError as error:
-            raise FileFormatError(f"{self.name}.picture: {error}") from error
-
-    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        described = super().describe(u, so_far)
-        if not self.free:
-            return described
-        here, start = (self.values(at)[self.shown] for at in (u.detach(), self.start.to(u.device)))
-        return {**changed(self.name, here - start), **described}
 
 
 class PatchControl(PictureControl):
@@ -200,12 +152,6 @@ class PatchControl(PictureControl):
     def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         pixels = values["pixels"]
         return {self.name: enlarged(pixels, -(-PRINT_SIDE // len(pixels))), f"{self.name}-pixels": pixels}
-
-
-def enlarged(pixels: Tensor, factor: int) -> Tensor:
-    """Return a picture (h, w, 3) sRGB at a whole multiple of its size, interpolated as the renderer does it."""
-    larger = F.interpolate(planes(srgb_to_linear(pixels)), scale_factor=factor, mode="bilinear", align_corners=False)
-    return linear_to_srgb(picture(larger))
 
 
 # ---- on the surface --------------------------------------------------------------------------------------------------

@@ -22,9 +22,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named
-from advsearch.controls.pose import euler
+from advsearch.controls.base import WAY, Choice, Control, Parameter, Value, Values, measure, named
 from advsearch.controls.ranges import OneOf, Spec, is_number
+from advsearch.controls.support.rotations import euler
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import PATH_ENDINGS
 from advsearch.options import rounded
@@ -49,7 +49,7 @@ APPROACH, PASS, TURN = "approach", "pass", "orbit"
 PATHS = (APPROACH, PASS, TURN)
 CAMERA, THING = MOVERS = "camera", "object"
 BOTH = "+"  # between the camera's path and the object's
-SEVERAL, WAY = ",", "way"  # between paths of which one is drawn, and the parameter that says which
+SEVERAL = ","  # between paths of which one is drawn
 MOST_PATHS = 64
 CLEAN_AT = {APPROACH: 1.0, PASS: 0.5, TURN: 0.0}  # share of the time at which the scene is as it is described
 
@@ -114,6 +114,7 @@ class PathControl(Control):
     """The camera, the object or both travel along a path; a frame is a time."""
 
     kind = "path"
+    travels = True
     parameters = (
         moving(ORBIT, "time", "s", 0.0, LONGEST, "where the scene is as it is", "Time since the path began."),
     )

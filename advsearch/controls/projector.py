@@ -25,9 +25,10 @@ from torch.nn import functional
 
 from advsearch.controls.base import LARGEST_EPSILON, Choice, Value, Values, measure, number
 from advsearch.controls.corruption_filters import picture, planes
-from advsearch.controls.patch import PRINT_SIDE, PictureControl, enlarged
 from advsearch.controls.ranges import Fixed, Range
-from advsearch.controls.texture import NORMS, radius
+from advsearch.controls.support.images import PRINT_SIDE, enlarged
+from advsearch.controls.support.norms import NORMS, radius
+from advsearch.controls.support.picture_control import PictureControl
 from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -60,6 +61,7 @@ class ProjectorControl(PictureControl):
     part: ProjectorPart
     _later = 0.0
     kind = "projector"
+    competes_with_ambient = True
     shown = "pattern"
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("pattern", (None, None, 3), "sRGB", 0.0, 1.0, "black, or grey",
@@ -189,12 +191,10 @@ class ProjectorControl(PictureControl):
 
     @property
     def ambient(self) -> float | None:
-        """Lux beside it; None where that is searched."""
         slot = next(one for one in self.slots if one.parameter.name == "ambient")
         return float(slot.spec.value) if isinstance(slot.spec, Fixed) else None
 
     def in_light(self, times: float) -> Self:
-        """Return the bound control in so many times the ambient light."""
         if self.ambient is None:
             return self
         there = copy.copy(self)

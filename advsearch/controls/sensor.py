@@ -23,8 +23,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.controls.base import Choice, Control, Values, number
-from advsearch.controls.corruption import coded
 from advsearch.controls.corruption_filters import drawn, picture, planes, warped
+from advsearch.controls.support.images import coded
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 
 _DARK = 1e-6  # keeps the slope of a square root finite in black

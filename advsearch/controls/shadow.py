@@ -20,8 +20,9 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure
-from advsearch.controls.occlusion import SURROUNDINGS, camera_in, put_away
-from advsearch.scene.assets import Doubles, Material, Mesh
+from advsearch.controls.support.meshes import polygon
+from advsearch.controls.support.visibility import SURROUNDINGS, camera_in, put_away
+from advsearch.scene.assets import Doubles, Material
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import arriving
 from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middle
@@ -130,18 +131,6 @@ class ShadowControl(Control):
             if away > size and math.acos(min(max(way[2] / away, -1.0), 1.0)) - math.asin(size / away) >= corner:
                 return float(far)
         return None
-
-
-@lru_cache(maxsize=8)
-def polygon(corners: int) -> Mesh:
-    """Return a regular polygon of radius 1 in the plane z = 0 that faces +z: its middle, then its corners."""
-    turns = 2.0 * np.pi * np.arange(corners) / corners
-    rim = np.stack([np.cos(turns), np.sin(turns), np.zeros(corners)], axis=1)
-    vertices = np.concatenate([np.zeros((1, 3)), rim]).astype(np.float32)
-    first = np.arange(corners)
-    faces = np.stack([np.zeros(corners, np.int64), first + 1, (first + 1) % corners + 1], axis=1).astype(np.uint32)
-    normals = np.tile(np.array([0.0, 0.0, 1.0], dtype=np.float32), (corners + 1, 1))
-    return Mesh(vertices, faces, normals, vertices[:, :2] / 2.0 + np.float32(0.5))
 
 
 @lru_cache(maxsize=8)

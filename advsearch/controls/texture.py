@@ -21,7 +21,8 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import LARGEST_EPSILON, NOTHING, Choice, Control, Parameter, Value, changed
-from advsearch.controls.corruption_filters import resized
+from advsearch.controls.support.images import resampled
+from advsearch.controls.support.norms import DEFAULT_EPSILON, NORMS, radius
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Bools, Floats
 from advsearch.scene.color import srgb_to_linear
@@ -31,9 +32,6 @@ from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import rasterised, texels_of_faces
 
 RESOLUTIONS = (256, 512)  # smallest and largest side that is taken from the object's own texture when none is asked for
-DEFAULT_EPSILON = 0.1
-"""Default radius of the L-infinity ball; the default L2 ball has the same root-mean-square change at its edge."""
-NORMS = ("linf", "l2")
 FORMS = ("texels", "palette", "waves")
 LARGEST_WAVES = 64
 LARGEST_PALETTE = 64
@@ -171,12 +169,6 @@ class TextureControl(Control):
         return {self.name: self._texels(u.detach()), f"{self.name}-original": self._original}
 
 
-def radius(norm: str, epsilon: float | None, count: int) -> float:
-    """Return the radius of a ball over `count` colours, `DEFAULT_EPSILON` where none is given: in an L2 ball so large
-    that its edge has the same root-mean-square."""
-    return DEFAULT_EPSILON * (math.sqrt(count) if norm == "l2" else 1.0) if epsilon is None else float(epsilon)
-
-
 class Painter(NamedTuple):
     """One form of the control: a map from its slice of u to the n texels that it paints, row by row."""
 
@@ -223,11 +215,6 @@ def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter
 
     start = torch.full((count * count * 3,), 0.5)
     return Painter(start, Group("amplitudes", len(start), ("adjoint",)), texels)
-
-
-def resampled(image: Tensor, side: int) -> Tensor:
-    """Resize an (h, w, 3) image to (side, side, 3) with an antialiased bilinear filter; values stay in [0, 1]."""
-    return resized(image, side, side).contiguous().clamp(0.0, 1.0)
 
 
 def palette(image: Tensor, weight: Floats, count: int) -> Tensor:

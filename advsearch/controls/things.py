@@ -21,9 +21,9 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Control, Parameter, Value, Values, measure, named
-from advsearch.controls.occlusion import camera_in
-from advsearch.controls.pose import euler
 from advsearch.controls.ranges import Slot
+from advsearch.controls.support.rotations import euler
+from advsearch.controls.support.visibility import camera_in
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Doubles
 from advsearch.scene.description import OBJECT, SceneDescription

@@ -25,7 +25,7 @@ from advsearch.scene.rig import read_rig
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
 from advsearch.tasks import Task
-from advsearch.tasks.together import Rig, Together, together
+from advsearch.tasks.together import Together, together
 from advsearch.trust.foreign_code import plainly
 
 
@@ -70,7 +70,7 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
 
     def load(model: Any, of: Task) -> Model:
         """Of several tasks, those that take no label or have names of their own are given none."""
-        part = of.part if isinstance(of, Rig) else of
+        part = of.of_one_image
         told = of is task or (part.labelled and not part.names_from)
         labels, prompt = (config.labels, config.prompt) if told else (None, None)
         model = (lent(MODEL, model) if isinstance(model, str) else None) or model
@@ -87,7 +87,7 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
         else:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
     if rig := () if config.camera is None else read_rig(config.camera):
-        if not isinstance(task, Rig):
+        if not task.judges_rig:
             raise InputError(
                 f"camera: {config.camera} has {len(rig)} cameras, and task {task.name} is of one picture; say what is "
                 f"made of several, as in `task='rig={{task: {task.name}, rule: any}}'`"

@@ -33,7 +33,7 @@ from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.things import ALL
 from advsearch.settings import as_python
 from advsearch.tasks import AnyTask, Facts, Mark, Prediction, Sight, make_task
-from advsearch.tasks.together import Rig, each_thing
+from advsearch.tasks.together import each_thing
 from advsearch.trust.foreign_code import plainly
 from advsearch.trust.writing import placed_by
 
@@ -203,7 +203,7 @@ def render(
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     scene = scene if texture is None else scene.with_texture(texture)
     made = make_task(task)
-    model = load_model(model, task=made.part if isinstance(made, Rig) else made)
+    model = load_model(model, task=made.of_one_image)
     model = replace(model, cameras=max(1, len(scene.description.rig)))
     check_judged(scene.description, judge)
     asked = made.on(model) if judge != ALL else each_thing(made.on(model))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from advsearch.catalog import list_built_ins
 from advsearch.errors import InputError, ModelError, UnknownNameError, resembling
 from advsearch.models import address, files, reference
 from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
@@ -19,7 +21,6 @@ from advsearch.models.labels import fitting_labels, labels_origin, names_in, rea
 from advsearch.models.model import PRESETS, Model, Preprocessing, Read
 from advsearch.models.probe import probe
 from advsearch.models.source import Purpose, Source, load_callable, source_of, split_weights
-from advsearch.models.zoo import outputs, transformers
 from advsearch.registry import Registry
 from advsearch.trust.foreign_code import called_under, plainly, turned_by_code
 
@@ -27,13 +28,7 @@ DEFAULT_INPUT_SIZE = (224, 224)  # where neither the model nor the caller says
 
 SOURCES: Registry[Callable[..., Source | Model]] = Registry(
     "advsearch.models",
-    {
-        "torchvision": outputs.load_torchvision,
-        "timm": outputs.load_timm,
-        "hf": transformers.load,
-        "http": address.load,
-        "https": address.load,
-    },
+    list_built_ins("model source"),
     "a function from the whole text, such as 'zoo:resnet18', to a Source or a Model",
     lambda name, entry: callable(entry),
 )
@@ -177,8 +172,7 @@ def _find(spec: object, purpose: Purpose) -> Source | Model:
     if isinstance(spec, Model):
         return spec
     if isinstance(spec, nn.Module):
-        known = transformers.of_network(spec, purpose) or outputs.of_timm(spec, purpose)
-        return known or source_of(spec, type(spec).__name__)
+        return _find_library_source(spec, purpose) or source_of(spec, type(spec).__name__)
     if isinstance(spec, os.PathLike):
         return files.load_file(Path(spec))
     if not isinstance(spec, str):
@@ -203,6 +197,20 @@ def _find(spec: object, purpose: Purpose) -> Source | Model:
     if re.fullmatch(r"[\w.-]+", text) and not resembling(text, ["reference"]):  # it may be a library's
         hint = f"A library's network is written with its library: 'torchvision:{text}' or 'timm:{text}'. {FORMS}"
     raise UnknownNameError("model", text, names, hint)
+
+
+def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
+    """Return the source of a network of transformers or timm; None of any other."""
+    source = None
+    if "transformers" in sys.modules and "hf" in SOURCES.own:
+        from advsearch.models.zoo import transformers  # late: most models are no network of it
+
+        source = transformers.of_network(network, purpose)
+    if source is None and "timm" in sys.modules and "timm" in SOURCES.own:
+        from advsearch.models.zoo import outputs  # likewise
+
+        source = outputs.of_timm(network, purpose)
+    return source
 
 
 def _preprocessing(source: Source, given: Mapping[str, object]) -> Preprocessing:

@@ -8,20 +8,16 @@ from typing import Any
 
 from torch import Tensor
 
+from advsearch.catalog import list_built_ins
 from advsearch.copies import copied
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model
 from advsearch.options import FROM_RUN, JOINED, check_options, check_takes, told
-from advsearch.registry import Registry
-from advsearch.tasks.answers import FreeAnswer
+from advsearch.registry import Registry, get_class
 from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Sight, Task
 from advsearch.tasks.classification import Classification
-from advsearch.tasks.command import Command
-from advsearch.tasks.depth import Depth
 from advsearch.tasks.detection import Detection
-from advsearch.tasks.segmentation import Segmentation
-from advsearch.tasks.similarity import Similarity
-from advsearch.tasks.together import Rig, Together
+from advsearch.tasks.together import Together
 
 MOST_NUMBERS = 4  # of an output that are said one by one
 
@@ -98,10 +94,7 @@ def function_of(task: Task) -> Callable[..., Tensor] | None:
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
-    {
-        kind.name: kind
-        for kind in (Classification, Detection, Segmentation, Depth, Similarity, FreeAnswer, Command, Rig)
-    },
+    list_built_ins("task"),
     "a subclass of Task whose name is that of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
 )
@@ -139,12 +132,20 @@ def make_task(task: AnyTask) -> Task:
     if name not in TASKS:
         raise UnknownNameError("task", name, TASKS)
     check_options("task", name, TASKS[name], options)
-    build: Callable[..., Task] = TASKS[name]
-    made = build(**options)
-    return replace(made, part=make_task(made.task)) if isinstance(made, Rig) else made
+    build: Callable[..., Any] = TASKS[name]
+    made: Any = build(**options)
+    if made.judges_rig:
+        made = replace(made, part=make_task(made.task))
+    result: Task = made
+    return result
+
+
+def __getattr__(name: str) -> Any:
+    """Import the class of another built-in task when it is asked for by name: Depth."""
+    return get_class("task", name)
 
 
 __all__ = [
-    "TASKS", "AnyTask", "Classification", "Command", "Depth", "Detection", "Facts", "FreeAnswer", "Judgement", "Mark",
-    "OwnTask", "Prediction", "Segmentation", "Sight", "Similarity", "Task", "function_of", "make_task", "own_task",
+    "TASKS", "AnyTask", "Classification", "Detection", "Facts", "Judgement", "Mark", "OwnTask", "Prediction", "Sight",
+    "Task", "function_of", "make_task", "own_task",
 ]  # fmt: skip

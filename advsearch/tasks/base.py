@@ -226,6 +226,8 @@ class Task(ABC):
         labelled: whether it takes a label; with one that takes none, others get it (`together`).
         names_from: where its names come from, if neither from the model nor from the setting `labels`.
         varies: whether the truth depends on the configuration; it is asked for at each one then.
+        judges_rig: whether it judges the images of several cameras together.
+        needs_all_images: whether one output is made of all images of a rig.
     """
 
     name: ClassVar[str]
@@ -234,6 +236,8 @@ class Task(ABC):
     labelled: ClassVar[bool] = True
     names_from: ClassVar[str] = ""
     varies: ClassVar[bool] = False
+    judges_rig: ClassVar[bool] = False
+    needs_all_images: ClassVar[bool] = False
 
     minimise: bool = field(default=False, metadata=FROM_RUN)
     target: Truth = field(default=None, metadata=FROM_RUN)
@@ -362,6 +366,11 @@ class Task(ABC):
     def average(self, outputs: Sequence[Output]) -> Output:
         """Return one output for several pictures of a configuration; each is of one picture, as is the result."""
         return torch.stack(list(outputs)).mean(dim=0)
+
+    @property
+    def of_one_image(self) -> Task:
+        """The task of a single image: of a rig of cameras that of each of its images, otherwise the task itself."""
+        return self
 
     @property
     def title(self) -> str:

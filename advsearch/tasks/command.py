@@ -52,6 +52,7 @@ class Command(Task):
 
     name = "command"
     labelled = False
+    needs_all_images = True
 
     state: Any = field(default_factory=dict)
     envelope: Any = None

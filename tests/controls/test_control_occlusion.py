@@ -14,8 +14,9 @@ import torch
 import advsearch
 from advsearch.controls import make_space
 from advsearch.controls.camera import CameraControl
-from advsearch.controls.occlusion import BUNDLED, OPTIONS, OcclusionControl, Placement, loaded, made, sphere
+from advsearch.controls.occlusion import BUNDLED, OPTIONS, OcclusionControl, Placement, loaded, made
 from advsearch.controls.pose import PoseControl
+from advsearch.controls.support.meshes import sphere
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.camera_model import bundled, pinhole
 from advsearch.scene.description import SceneDescription, describe

@@ -14,7 +14,7 @@ from samples import make_attacked
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.export import write_projection
+from advsearch.api.projection import write_projection
 from advsearch.controls import make_control
 from advsearch.controls.projector import AMBIENT, ProjectorControl, ambient_irradiance
 from advsearch.controls.space import Space

@@ -12,8 +12,9 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.controls import make_control
-from advsearch.controls.shadow import polygon, strongest_light
+from advsearch.controls.shadow import strongest_light
 from advsearch.controls.space import Space
+from advsearch.controls.support.meshes import polygon
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world, middle
 from advsearch.scene.renderer import Renderer

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from importlib import import_module
 from typing import Any
 
 import pytest
@@ -12,7 +11,7 @@ from conftest import ROOT
 from hostile import SHORT, shown
 
 from advsearch import load_scene
-from advsearch.controls import CONTROLS, OWN, Control, TextureControl, make_control, make_space
+from advsearch.controls import CONTROLS, Control, TextureControl, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import describe
@@ -35,15 +34,6 @@ def bound(kind: str, object: str = "mug") -> Control:
     return make_space(
         [make_control(kind, NEEDED.get(kind))], describe(SUITS.get(kind, object), things=BESIDE)
     ).controls[0]
-
-
-def test_every_module_of_the_folder_is_a_control_or_shared_by_several() -> None:
-    for kind, name in OWN.items():
-        found = getattr(import_module(f"advsearch.controls.{kind}"), name, None)
-        assert getattr(found, "kind", None) == kind, (
-            f'advsearch/controls/{kind}.py: expected a class {name} with kind = "{kind}"; a module that is no control '
-            f"is named in SHARED of advsearch/controls/__init__.py"
-        )
 
 
 @every_control

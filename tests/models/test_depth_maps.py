@@ -12,8 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch import load_model
-from advsearch.tasks import Depth
-from advsearch.tasks.depth import DISPARITY, METRIC, Distances
+from advsearch.tasks.depth import DISPARITY, METRIC, Depth, Distances
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 

@@ -22,7 +22,7 @@ from advsearch.models.zoo import language
 from advsearch.models.zoo import transformers as own
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
-from advsearch.tasks import FreeAnswer
+from advsearch.tasks.answers import FreeAnswer
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 

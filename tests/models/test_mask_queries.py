@@ -14,8 +14,7 @@ from torch import nn
 
 from advsearch import load_model
 from advsearch.models import ModelWarning
-from advsearch.tasks import Segmentation
-from advsearch.tasks.segmentation import Region
+from advsearch.tasks.segmentation import Region, Segmentation
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 

@@ -21,8 +21,9 @@ from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.source import Purpose
 from advsearch.models.zoo import outputs
 from advsearch.models.zoo.transformers import PATIENCE
-from advsearch.tasks import Detection, Similarity
+from advsearch.tasks import Detection
 from advsearch.tasks.boxes import Place
+from advsearch.tasks.similarity import Similarity
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 huggingface_hub = pytest.importorskip("huggingface_hub")

@@ -16,7 +16,7 @@ import advsearch
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, ModelError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.labels import read_labels
-from advsearch.tasks import Depth
+from advsearch.tasks.depth import Depth
 
 transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
 

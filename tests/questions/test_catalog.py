@@ -1,7 +1,8 @@
-"""Experiments are listed in the catalog or come from packages; without one of them the tool works."""
+"""Parts are listed in the catalog or come from packages; without one of them the tool works."""
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -18,13 +19,20 @@ from advsearch.settings import HEADER
 
 PACKAGE = Path(advsearch.__file__).parent
 CORE = ("attack", "sweep", "render")
-REMOVABLE = [part for part in BUILT_INS if part.name not in CORE]
+REMOVABLE = [part for part in BUILT_INS if part.kind == "experiment" and part.name not in CORE]
+CORE_PARTS = {
+    "control": "pose camera texture material light environment geometry",
+    "policy": "random grid pgd adam cmaes nes auto sobol restarts portfolio",
+    "task": "classification detection",
+    "reader": "obj ply stl gltf glb vrm",
+}
+"""Parts that are not removed, those in their modules included."""
 
 
 def test_every_part_of_the_catalog_is_there_and_is_what_it_says() -> None:
     for part in BUILT_INS:
         assert is_present(part.target.partition(":")[0]), part
-        assert part.help[0].islower() and not part.help.endswith("."), part
+        assert not part.help.endswith("."), part
     for name, experiment in registry.EXPERIMENTS.items():
         assert isinstance(experiment, Experiment)
         assert experiment.settings.command == name and experiment.result.command == name
@@ -107,9 +115,58 @@ for removed in sys.argv[1:]:
 def test_without_any_one_experiment_all_others_can_be_imported() -> None:
     removable = [part.name for part in REMOVABLE]
     done = run_python(PACKAGE.parent, "-c", IMPORT_WITHOUT_EACH, *removable)
-    every = {part.name for part in BUILT_INS}
+    every = {part.name for part in BUILT_INS if part.kind == "experiment"}
     expected = [" ".join([name, *sorted(every - {name})]) for name in removable]
     assert done.stdout.splitlines() == expected, done.stderr
+
+
+def list_removable_modules() -> dict[str, list[str]]:
+    """Return the modules of parts outside the core, each with its parts as "kind name"."""
+    found: dict[str, list[str]] = {}
+    for part in BUILT_INS:
+        is_core = part.name in CORE_PARTS.get(part.kind, "").split()
+        if part.kind not in ("experiment", "model source") and not is_core:
+            found.setdefault(part.target.partition(":")[0], []).append(f"{part.kind} {part.name}")
+    return found
+
+
+def test_without_all_removable_parts_the_tool_works(tmp_path: Path) -> None:
+    copy_package(tmp_path)
+    for module in list_removable_modules():
+        tmp_path.joinpath(*module.split(".")).with_suffix(".py").unlink()
+    listed = run_python(tmp_path, "-m", "advsearch", "list", "controls")
+    assert listed.returncode == 0, listed.stderr
+    assert [line.split()[0] for line in listed.stdout.splitlines()] == CORE_PARTS["control"].split()
+    words = ["--control", "pose", "--resolution", "32", "--spp", "2", "--run"]
+    swept = run_python(tmp_path, "-m", "advsearch", "sweep", "--object", "mug", "--samples", "2", *words, "swept")
+    assert swept.returncode == 0, swept.stderr
+    attack = ["attack", "--object", "mug", "--steps", "2", "--trials", "6", "--verify-spp", "2", "--no-baseline"]
+    attacked = run_python(tmp_path, "-m", "advsearch", *attack, *words, "attacked", "--json")
+    assert attacked.returncode == 0, attacked.stderr
+    exported = run_python(tmp_path, "-m", "advsearch", "export", "attacked", "--out", "rows.csv")
+    assert exported.returncode == 0, exported.stderr
+
+
+def test_no_control_imports_another_one() -> None:
+    modules = {part.target.partition(":")[0] for part in BUILT_INS if part.kind == "control"}
+    allowed = {("advsearch.controls.spot", "advsearch.controls.projector")}  # a spot is a projector: one family
+    found = set()
+    for module in modules:
+        source = PACKAGE.joinpath(*module.split(".")[1:]).with_suffix(".py").read_text("utf-8")
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.ImportFrom) and node.module in modules - {module}:
+                found.add((module, node.module))
+    assert found == allowed
+
+
+def test_the_list_of_commands_imports_nothing_heavy() -> None:
+    code = (
+        "import contextlib, io, sys\nfrom advsearch.cli.main import main\n"
+        "with contextlib.redirect_stdout(io.StringIO()):\n    main(['--help'])\n"
+        "print(*{'numpy', 'torch', 'mitsuba', 'pandas'} & {*sys.modules})"
+    )
+    done = run_python(PACKAGE.parent, "-c", code)
+    assert done.returncode == 0 and done.stdout == "\n", done.stdout + done.stderr
 
 
 SETUP = """from setuptools import setup

@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 from samples import attack, rated
 
-from advsearch.cli.export import WRITERS
 from advsearch.cli.main import main
 from advsearch.errors import StorageError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import FORMATS, as_columns, write_rows
+from advsearch.runs.exporters import EXPORTERS
 from advsearch.runs.listing import finished, listed_runs
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer.pages import keep_result
@@ -126,10 +126,10 @@ def test_a_table_that_cannot_be_written_names_out(run: Path, capsys: pytest.Capt
     assert capsys.readouterr().err.endswith("choose another place with --out\n")
 
 
-@pytest.mark.parametrize("format", WRITERS)
+@pytest.mark.parametrize("format", EXPORTERS)
 def test_what_is_no_table_says_what_it_writes_and_is_in_the_help(format: str, run: Path, capsys: Any) -> None:
-    writer = WRITERS[format]
-    said = writer.text
+    writer = EXPORTERS[format]
+    said = EXPORTERS.get_help(format)
     assert said.endswith(".") and "\n" not in said, f"{format}: expected a sentence"
     assert f"--format {format}" in writer.example and "--out" in writer.example, f"{format}: an example with --format"
     assert main(["export", "--help"]) == 0

@@ -25,7 +25,8 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import LinearRenderer
-from advsearch.tasks import Depth, Facts
+from advsearch.tasks import Facts
+from advsearch.tasks.depth import Depth
 
 HERE = Path(__file__).parent
 TABLE: dict[str, Any] = json.loads((HERE / "camera_reference.json").read_text("utf-8"))

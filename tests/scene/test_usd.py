@@ -18,15 +18,13 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.glb import glb
-from advsearch.scene.importing import blender
+from advsearch.scene.importing import usd
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import contents
 from advsearch.scene.library import load_object
 from advsearch.scene.parts import PointLamp, SpotLamp
 
-needs_usd = pytest.mark.skipif(
-    not blender.is_installed(), reason="usd-core is not installed: pip install 'advsearch[usd]'"
-)
+needs_usd = pytest.mark.skipif(not usd.is_installed(), reason="usd-core is not installed: pip install 'advsearch[usd]'")
 PREVIEW = """
     def Material "{name}" {{
         token outputs:surface.connect = </Root/{name}/surface.outputs:surface>
@@ -536,7 +534,7 @@ def test_damaged_files_and_large_ones_end_in_a_sentence(
 
 
 def test_without_usd_core_the_command_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(blender, "is_installed", lambda: False)
+    monkeypatch.setattr(usd, "is_installed", lambda: False)
     with pytest.raises(FileFormatError, match=re.escape("pip install 'advsearch[usd]'")):
         import_object(written(tmp_path, mesh(CUBE, SIDES)))
     (tmp_path / "other.usdc").write_bytes(b"ply\n")

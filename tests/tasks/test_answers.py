@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.errors import InputError, ModelError
-from advsearch.tasks import Facts, FreeAnswer, Prediction, make_task
-from advsearch.tasks.answers import Utterance, has_word
+from advsearch.tasks import Facts, Prediction, make_task
+from advsearch.tasks.answers import FreeAnswer, Utterance, has_word
 
 VOCABULARY = ("a", "mug", "cup", "bowl", ".")
 

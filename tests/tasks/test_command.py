@@ -18,7 +18,8 @@ from advsearch.errors import AdvsearchError, FileFormatError, InputError, ModelE
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.options import as_setting
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.tasks import Command, Facts, make_task
+from advsearch.tasks import Facts, make_task
+from advsearch.tasks.command import Command
 
 SIDE = 24
 ASKED: dict[str, Any] = {

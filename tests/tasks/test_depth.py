@@ -21,8 +21,19 @@ from advsearch.errors import InputError, ModelError
 from advsearch.options import NOT_A_NUMBER
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
-from advsearch.tasks import Depth, Facts, Sight, make_task
-from advsearch.tasks.depth import AS_FAR, DISPARITY, FARTHER, GONE, METRIC, NEARER, OUT_OF_SHAPE, RELATIVE, Distances
+from advsearch.tasks import Facts, Sight, make_task
+from advsearch.tasks.depth import (
+    AS_FAR,
+    DISPARITY,
+    FARTHER,
+    GONE,
+    METRIC,
+    NEARER,
+    OUT_OF_SHAPE,
+    RELATIVE,
+    Depth,
+    Distances,
+)
 
 HIGH, WIDE = 8, 10
 MASK = torch.zeros(HIGH, WIDE).bool()

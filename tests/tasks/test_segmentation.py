@@ -14,8 +14,8 @@ from advsearch.attacks.objectives import get_objective
 from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
 from advsearch.options import NOT_A_NUMBER
-from advsearch.tasks import Facts, Prediction, Segmentation, Sight
-from advsearch.tasks.segmentation import Region
+from advsearch.tasks import Facts, Prediction, Sight
+from advsearch.tasks.segmentation import Region, Segmentation
 
 NAMES = ("background", "bottle", "chair")
 TASK = Segmentation(labels=NAMES)

@@ -22,8 +22,8 @@ from advsearch.errors import AdvsearchError, InputError, ModelError
 from advsearch.models import Model, ModelWarning
 from advsearch.runs.files import read_png, to_8bit
 from advsearch.runs.summary import file_digests
-from advsearch.tasks import Facts, Similarity, make_task
-from advsearch.tasks.similarity import ELSE, ITSELF, TEMPERATURE
+from advsearch.tasks import Facts, make_task
+from advsearch.tasks.similarity import ELSE, ITSELF, TEMPERATURE, Similarity
 
 COLOURS = {"blue": (0.2, 0.3, 0.9), "green": (0.2, 0.8, 0.3), "red": (0.9, 0.2, 0.2)}
 NAMES = tuple(COLOURS)

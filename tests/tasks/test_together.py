@@ -19,8 +19,9 @@ from advsearch.models import Model
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.files import read_png
 from advsearch.runs.store import Store
-from advsearch.tasks import Depth, Detection, Facts, Segmentation, Sight, Task, make_task
-from advsearch.tasks.depth import AS_FAR, DISPARITY, GONE
+from advsearch.tasks import Detection, Facts, Sight, Task, make_task
+from advsearch.tasks.depth import AS_FAR, DISPARITY, GONE, Depth
+from advsearch.tasks.segmentation import Segmentation
 from advsearch.tasks.together import Together, together
 
 BOTH = {"name": "detection+depth", "depth": {"kind": DISPARITY}}

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import is_dataclass
-from importlib import import_module
-from pkgutil import iter_modules
 from typing import Any
 
 from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
@@ -14,23 +12,14 @@ from advsearch.attacks.policies.choices import Choices
 from advsearch.attacks.policies.evolution import CMAES, NES
 from advsearch.attacks.policies.pgd import PGD, Adam
 from advsearch.attacks.policies.sampling import Grid, Random, Sobol
+from advsearch.catalog import list_built_ins
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import check_options
 from advsearch.registry import Registry
 
-INSIDE = ("choices",)  # policies that only the search asks for
-
-
-def _own() -> dict[str, type[Policy[Any]]]:
-    modules = [import_module(f"{__name__}.{module.name}") for module in iter_modules(__path__)]
-    classes = [entry for module in modules for entry in vars(module).values() if isinstance(entry, type)]
-    named = {entry.name: entry for entry in classes if issubclass(entry, Policy) and "name" in vars(entry)}
-    return {name: entry for name, entry in sorted(named.items()) if name not in INSIDE}
-
-
 POLICIES: Registry[type[Policy[Any]]] = Registry(
     "advsearch.policies",
-    _own(),
+    list_built_ins("policy"),
     "a dataclass over Policy whose name is that of the entry point",
     lambda name, entry: (
         isinstance(entry, type) and is_dataclass(entry) and issubclass(entry, Policy) and entry.name == name

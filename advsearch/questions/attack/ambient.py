@@ -13,7 +13,6 @@ from advsearch.attacks import (
     Ending,
     verify,
 )
-from advsearch.controls.projector import ProjectorControl
 from advsearch.engine.journal import ProblemKey, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import Verifier
@@ -31,8 +30,8 @@ def find_ambient(verifier: Verifier, u: Tensor) -> None:
     the same seeds, which nothing else has. What comes of it is in `verifier.findings`.
     """
     problem, findings = verifier.problem, verifier.findings
-    projectors = [bound for bound in problem.searched_space.controls if isinstance(bound, ProjectorControl)]
-    own = projectors[0].ambient if projectors else None  # and None where they are searched too
+    ambients = [bound.ambient for bound in problem.searched_space.controls if bound.competes_with_ambient]
+    own = ambients[0] if ambients else None  # and None where they are searched too
     if own is None or findings.verification is None:
         return
     tried = findings.ambient
@@ -67,9 +66,7 @@ def problems_by_key(problem: Problem) -> Callable[[ProblemKey], Problem]:
 
 
 def in_light(problem: Problem, times: float) -> Problem:
-    controls = [
-        bound.in_light(times) if isinstance(bound, ProjectorControl) else bound for bound in problem.space.controls
-    ]
+    controls = [bound.in_light(times) for bound in problem.space.controls]
     space, renderer = replace(problem.space, controls=tuple(controls)), problem.renderer.like()
     renderer.space = space
     return replace(problem, space=space, renderer=renderer)

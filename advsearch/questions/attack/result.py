@@ -17,7 +17,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult
-from advsearch.controls.path import WAY, PathControl
+from advsearch.controls.base import WAY
 from advsearch.controls.ranges import OneOf
 from advsearch.engine.judging import task_for
 from advsearch.engine.loading import Scene, load_scene
@@ -334,9 +334,7 @@ def along_drive(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory 
     None where none does. What varies beside it is as the scene comes."""
     place, path = len(problem.domain.start), None
     for control in problem.space.controls[len(problem.searched_space.controls) :]:
-        if isinstance(control, PathControl) and any(
-            slot.parameter.name == "time" and slot.width for slot in control.slots
-        ):
+        if control.travels and any(slot.parameter.name == "time" and slot.width for slot in control.slots):
             path = control
             break
         place += len(control.start)

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.keywords import asks, configured
-from advsearch.controls.corruption import coded
 from advsearch.controls.sensor import SensorControl, through_sensor
+from advsearch.controls.support.images import coded
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import control_group, verified_rate

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import PGD, Adam, Auto, Query
-from advsearch.controls.occlusion import sphere
+from advsearch.controls.support.meshes import sphere
 from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.record import Results, taken_rows
 from advsearch.errors import InputError, UnknownNameError

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from advsearch.controls import Control
-from advsearch.controls.path import WAY, PathControl
+from advsearch.controls.base import WAY
 from advsearch.engine.naming import given_to
 from advsearch.options import OUT_OF_VIEW
 from advsearch.questions.attack.result import evenly, write_drive
@@ -38,10 +39,9 @@ Flags = npt.NDArray[np.int8]
 
 def with_frames(config: SweepConfig, drawn: tuple[Control, ...]) -> tuple[tuple[Control, ...], dict[str, object]]:
     """Return the controls with what travels along the path of the configuration, and the grid with its frames last."""
-    travelling = next((one for one in drawn if isinstance(one, PathControl)), None)
+    travelling: Any = next((one for one in drawn if one.travels), None)
     if travelling is None:
-        (added,) = given_to(config, {PathControl.kind: {}})
-        assert isinstance(added, PathControl)
+        (added,) = given_to(config, {"path": {}})
         drawn, travelling = (*drawn, added), added
     name, seconds = f"{travelling.name}.time", travelling.seconds
     frames = f"0:{seconds:g}:{max(2, round(seconds * config.fps) + 1)}"
@@ -65,8 +65,8 @@ def planned_distances(job: Job, axis: Axis) -> tuple[float, float] | None:
     lowest, highest = math.inf, -math.inf
     for scene in range(len(job.places)):
         for points in job.bound(scene).values():
-            control = next((one for one in points.space.controls if one.name == axis.instance), None)
-            if not isinstance(control, PathControl):
+            control: Any = next((one for one in points.space.controls if one.name == axis.instance), None)
+            if control is None or not control.travels:
                 return None
             distances = control.distances(times)
             lowest, highest = min(lowest, float(distances.min())), max(highest, float(distances.max()))

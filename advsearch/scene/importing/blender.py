@@ -1,4 +1,4 @@
-"""Blender and OpenUSD files through glTF.
+"""Blender files through glTF.
 
 A Blender file is written as glTF by Blender in a process of its own: an installed one, or the `bpy` package. Nothing in
 the file is run: Blender starts with factory settings and a home that is empty, and scripts and drivers are
@@ -9,7 +9,6 @@ leaves out or applies.
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
 import shutil
 import sys
@@ -18,71 +17,9 @@ from pathlib import Path
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.importing.files import damaged, looks_like, read_bytes, shown
-from advsearch.trust import stored_files
-from advsearch.trust.code import OWN_FOLDER
 from advsearch.trust.programs import run_converter, surroundings
 from advsearch.trust.stored_files import LARGEST_FILE, scaled
 
-# ---------------------------------------------------------------------------------------------------------------------
-# OpenUSD files through glTF, which a process of its own makes of them with `usd-core`: readers of binary formats are
-# written in C++, and a file may make them crash or take all memory.
-
-PACKAGE = ".usdz"
-LAYERS = (".usd", ".usda", ".usdc")
-USD = (*LAYERS, PACKAGE)  # endings of OpenUSD files
-GENERATOR = "advsearch, of OpenUSD"  # what the glTF is made by; what it leaves out is in the extras of its asset
-USD_LONGEST = 120  # seconds that it may take, before `scaled`
-MEMORY = 8 << 30  # bytes of memory that it may take, before `scaled`
-USD_BEGINNINGS = (b"PXR-USDC", b"#usda", b"PK\x03\x04")
-REFUSED = "refused: "
-_LIMITED = f"""
-import runpy, sys
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[1]),) * 2)
-    resource.setrlimit(resource.RLIMIT_FSIZE, ({LARGEST_FILE} * 4,) * 2)
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-except ImportError:
-    pass
-del sys.argv[1]
-runpy.run_module("advsearch.scene.importing.usd_stage", run_name="__main__", alter_sys=True)
-"""
-
-
-def is_installed() -> bool:
-    return importlib.util.find_spec("pxr") is not None
-
-
-def converted(path: Path, data: bytes) -> bytes:
-    """Return an OpenUSD file as binary glTF. Raises FileFormatError: it is none, names what lies outside its folder, is
-    too large, or `usd-core` is missing."""
-    if not data.startswith(USD_BEGINNINGS):
-        raise damaged(path, "an OpenUSD file", looks_like(data))
-    if not is_installed():
-        raise FileFormatError(
-            f"{path}: an OpenUSD file needs usd-core, which is not installed: pip install 'advsearch[usd]'; or export "
-            "glTF (.glb) where it is from"
-        )
-    with tempfile.TemporaryDirectory(prefix="advsearch-usd-") as folder:
-        target, inside = Path(folder) / "scene.glb", Path(folder) / "package"
-        inside.mkdir()
-        names = [str(scaled(MEMORY)), str(path.resolve()), str(target), str(inside)]
-        program = [sys.executable, "-W", "ignore", "-c", _LIMITED, *names]
-        done = run_converter(path, "usd-core", program, folder=OWN_FOLDER, seconds=USD_LONGEST, env=None)
-        if done.returncode or not target.is_file():
-            lines = [line for line in done.stderr.splitlines() if line.strip()] or ["without a word"]
-            last = lines[-1]
-            if last.startswith(REFUSED):
-                text = last.removeprefix(REFUSED)
-                raise FileFormatError(f"{path.parent / text}" if text.startswith(path.name) else f"{path}: {text}")
-            crashed = f"signal {-done.returncode}" if done.returncode < 0 else shown(last.strip(), quoted=False)
-            raise FileFormatError(f"{path}: usd-core could not read it ({crashed}); export or download it again")
-        for name in json.loads(done.stdout.splitlines()[-1]):
-            stored_files.note_opened(name)
-        return stored_files.read_bytes(target, "a glTF file", 4 * LARGEST_FILE)
-
-
-BLEND = ".blend"
 PROGRAM = "ADVSEARCH_BLENDER"
 """Variable of the environment: a Blender, or a Python that has `bpy`, in the place of those that are looked for."""
 LONGEST = 120  # seconds that Blender may take, before `scaled`
@@ -108,14 +45,9 @@ bpy.ops.export_scene.gltf(
 """
 
 
-def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
-    """Return the content of a mesh or scene file, of a Blender or OpenUSD file as binary glTF; see `read_bytes`. Raises
-    FileFormatError: as for `read_bytes`; there is no Blender, it can't read the file, or it takes too long."""
-    data = read_bytes(path, what, suffixes)
-    if path.suffix.lower() in USD:
-        return converted(path, data)
-    if path.suffix.lower() != BLEND:
-        return data
+def convert_blend(path: Path, data: bytes) -> bytes:
+    """Return a Blender file as binary glTF. Raises FileFormatError: it is none, there is no Blender, it can't read the
+    file, or it takes too long."""
     if not data.startswith(BEGINNINGS):
         raise damaged(path, "a Blender scene", looks_like(data))
     program = command(f"{path}: Blender has to read it", "export glTF (.glb) from Blender and name that")

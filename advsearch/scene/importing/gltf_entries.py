@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, FailFast, Field, JsonValue
 
+GENERATOR = "advsearch, of OpenUSD"  # what the glTF is made by; what it leaves out is in the extras of its asset
 T = TypeVar("T")
 List = Annotated[list[T], FailFast()]
 """A list of which only the first wrong entry is reported; a million reports take gigabytes."""

@@ -16,10 +16,17 @@ from advsearch.errors import FileFormatError
 from advsearch.scene.assets import Doubles, Floats, Ints, face_vectors
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import gltf_entries, gltf_skeleton
-from advsearch.scene.importing.blender import GENERATOR
 from advsearch.scene.importing.files import SPLATS, Notes, check_faces, damaged, shown
 from advsearch.scene.importing.gltf import READ, GltfFile, is_of_splats, unread_extensions
-from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header, MaterialEntry, Primitive, Sampler, TextureUse
+from advsearch.scene.importing.gltf_entries import (
+    CUT_OUTS,
+    GENERATOR,
+    Header,
+    MaterialEntry,
+    Primitive,
+    Sampler,
+    TextureUse,
+)
 from advsearch.scene.importing.parts import (
     FLAT,
     ImportedPart,

@@ -1,27 +1,22 @@
 """Objects from mesh files: ``--object path.obj`` and the other endings of `advsearch.files.MESHES`.
 
 A file is a list of parts: one piece of geometry with one surface each, in the file's own coordinates. The formats have
-readers of our own: those that there are drop without a word what they do not know. That of STL is here.
+readers of our own: those that there are drop without a word what they do not know.
 """
 
 from __future__ import annotations
 
-import re
-import struct
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 from scipy.spatial import ConvexHull, QhullError
 
-from advsearch.errors import FileFormatError, InputError
-from advsearch.files import MESHES
+from advsearch.errors import InputError
 from advsearch.pictures import without_pillows_limit
 from advsearch.scene.assets import (
     FACINGS,
@@ -36,96 +31,13 @@ from advsearch.scene.assets import (
     grouped,
     normalised,
 )
-from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing import gltf, gltf_parts
-from advsearch.scene.importing.blender import BLEND, USD, read_mesh_bytes
-from advsearch.scene.importing.files import Notes, looks_like, safe_name, shown, text_of
+from advsearch.scene.importing.files import Notes, safe_name, shown
 from advsearch.scene.importing.geometry import Soup, assemble, compute_turn, extent_of, join, repaired
 from advsearch.scene.importing.gltf_entries import Header
-from advsearch.scene.importing.gltf_parts import read_gltf
-from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, visible
-from advsearch.scene.importing.ply import read_ply
+from advsearch.scene.importing.parts import ImportedPart, ImportedSurface, visible
+from advsearch.scene.importing.readers import GLTF, get_reader, list_suffixes, read_mesh_bytes
 from advsearch.scene.importing.texture import by_material, textured
-from advsearch.scene.importing.wavefront import read_obj
-
-Attributes = npt.NDArray[np.uint16]
-_FACET = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attribute", "<u2")])
-_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
-_NAMED = re.compile(rb"^[ \t]*(?:end[ \t]?)?solid\b(?:(?!facet\s+normal)[^\n])*", re.IGNORECASE | re.MULTILINE)
-_WORDS = frozenset("facet outer vertex endloop endfacet end".split())
-_OWN = 0x8000
-
-
-def read_stl(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
-    """Read an STL file as one part; its facet normals are made anew, as every program does. Raises FileFormatError: it
-    is damaged, or has no facets."""
-    promised = 84 + 50 * struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 84
-    corners, surface = None, ImportedSurface()
-    if len(data) == promised:
-        notes.check_faces((promised - 84) // 50)
-        facets = np.frombuffer(data, _FACET, offset=84)
-        points = facets["vertices"].astype(np.float64).reshape(-1, 3)
-        colors = _colors(data[:80], facets["attribute"], notes)
-        if colors is not None:
-            corners, surface = np.repeat(colors[:, None], 3, axis=1), ImportedSurface(color=np.ones(3, np.float32))
-    elif data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
-        points = _of_text(data, notes)
-    else:
-        kind = looks_like(data)
-        got = f"{len(data)} bytes, which is neither ASCII nor that long" if "another" in kind else kind
-        raise notes.damaged(f"an STL file (in binary, {promised} bytes for its number of facets)", got)
-    if not len(points):
-        raise FileFormatError(f"{path}: expected a mesh with faces, got none; export triangles")
-    return [ImportedPart(points, np.arange(len(points)).reshape(-1, 3), None, None, corners, surface)]
-
-
-def _of_text(data: bytes, notes: Notes) -> Doubles:
-    if not re.search(rb"\bend\s?solid", data, re.IGNORECASE):
-        raise notes.damaged("an ASCII STL file that ends in 'endsolid'", "one that is cut short")
-    data = _NAMED.sub(b"", data.replace(b"\r", b"\n"))
-    found = _VERTEX.findall(data)
-    notes.check_faces(len(found) // 3)
-    if len(found) % 3 or len(found) != 3 * len(re.findall(rb"\bouter\s+loop\b", data, re.IGNORECASE)):
-        raise notes.damaged("facets with 3 vertices", f"{len(found):,} vertices in all")
-    try:
-        points = np.array(found).astype(np.float64)
-    except ValueError:
-        raise notes.damaged("three numbers after each 'vertex'", "something else") from None
-    for word in re.findall(rb"^[ \t]*([^\s\d]\S*)", data, re.MULTILINE):
-        if text_of(word).lower() not in _WORDS:
-            notes.has("statement", text_of(word))
-    return points.reshape(-1, 3)
-
-
-def _colors(head: bytes, attributes: Attributes, notes: Notes) -> Doubles | None:
-    # Two programs have their own ways, with 5 bits a channel. Magics writes ``COLOR=`` and four bytes, the colour of
-    # all, into the header, and red in the lowest bits of a facet whose highest bit is not set. VisCAM has blue in the
-    # lowest bits, and sets the highest where a facet has a colour.
-    magics = head.find(b"COLOR=")
-    bits = np.stack([(attributes >> shift) & 31 for shift in (10, 5, 0)], axis=1).astype(np.float32) / np.float32(31.0)
-    if 0 <= magics <= 70:
-        if b"MATERIAL=" in head:
-            notes.has("header entry", "MATERIAL")
-        colored = (attributes & _OWN == 0) & bool(attributes.any())
-        bits, plain = bits[:, ::-1], np.frombuffer(head, np.uint8, 3, magics + 6) / np.float32(255.0)
-        if head[magics + 9] < 255 and head[magics + 9] > 0:
-            notes.has("opacity of its header entry", "COLOR")
-    else:
-        colored, plain = attributes & _OWN != 0, np.full(3, NEUTRAL, np.float32)
-        if not colored.any():
-            if attributes.any():
-                notes.has("attribute bytes of its facets, which are no colours known here,", f"{attributes.max():#06x}")
-            return None
-    display = np.where(colored[:, None], bits, plain).astype(np.float32)
-    return np.asarray(srgb_to_linear(display), dtype=np.float64)
-
-
-GLTF = (".glb", ".gltf", ".vrm", ".blend", *USD)
-"""Endings of glTF files, which have conventions of their own: y up, linear colours; and of what is read as glTF."""
-Reader = Callable[[Path, bytes, Notes], list[ImportedPart]]
-"""From a file, its content and what is said of it to its parts that have faces; raises as `read_parts`."""
-READERS: dict[str, Reader] = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, **dict.fromkeys(GLTF, read_gltf)}
-"""Readers by the endings of files."""
 
 
 def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
@@ -135,7 +47,7 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     with warnings.catch_warnings(), np.errstate(all="ignore"), without_pillows_limit():
         warnings.simplefilter("ignore")
         notes = Notes(path)
-        return READERS[path.suffix.lower()](path, data, notes), list(notes)
+        return get_reader(path.suffix.lower())(path, data, notes), list(notes)
 
 
 MOST_WARNINGS = 20  # warnings about one file
@@ -166,7 +78,7 @@ def import_object(
     if up not in (None, "y", "z"):
         raise InputError(f"up axis: expected 'y' or 'z', got {up!r}")
     file = Path(path)
-    data = read_mesh_bytes(file, "object", MESHES)
+    data = read_mesh_bytes(file, "object", list_suffixes())
     parts, notes = read_parts(file, data)
     header = gltf.read_header(file, data) if file.suffix.lower() in GLTF else None
     notes += [] if header is None else gltf_parts.beside(header, file.name)
@@ -191,6 +103,8 @@ def check_facing(facing: str, up: str | None) -> str:
 OUR_FRONT = "+x"
 """What is taken for the front where a format has no rule: the axis along which bundled objects face."""
 UP_OF_FRONT = {"y": "z", "z": "y"}  # the axis that points up where the front is along another one that might
+BLEND = ".blend"
+USD = (".usd", ".usda", ".usdc", ".usdz")
 VRM_0, VRM_1 = "VRM", "VRMC_vrm"  # extensions of glTF
 
 

@@ -16,16 +16,15 @@ from pathlib import Path
 import numpy as np
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.files import MESHES
 from advsearch.scene.assets import Doubles, ObjectAsset, face_vectors, footing
 from advsearch.scene.importing import gltf, gltf_parts
-from advsearch.scene.importing.blender import GENERATOR, read_mesh_bytes
 from advsearch.scene.importing.files import Names, clean, safe_name, shown
 from advsearch.scene.importing.geometry import FLAT, compute_turn
-from advsearch.scene.importing.gltf_entries import CameraEntry, Header, LightEntry
+from advsearch.scene.importing.gltf_entries import GENERATOR, CameraEntry, Header, LightEntry
 from advsearch.scene.importing.gltf_skeleton import poses
-from advsearch.scene.importing.objects import GLTF, find_front, object_of, read_parts
+from advsearch.scene.importing.objects import find_front, object_of, read_parts
 from advsearch.scene.importing.parts import ImportedPart, visible
+from advsearch.scene.importing.readers import GLTF, list_suffixes, read_mesh_bytes
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
 from advsearch.scene.skeleton import with_above
 
@@ -160,7 +159,7 @@ class Contents:
 def contents(path: Path) -> Contents:
     """Return what is understood of a mesh or glTF file; one of Mitsuba has a function of that name of its own. Raises
     FileFormatError, InputError: as for `import_object`."""
-    data = read_mesh_bytes(path, "object", (*MESHES, MITSUBA_FILE))
+    data = read_mesh_bytes(path, "object", (*list_suffixes(), MITSUBA_FILE))
     parts, notes = read_parts(path, data)
     if path.suffix.lower() not in GLTF:
         return Contents(object_of(parts, notes, path, safe_name(path), None, find_front(path, None)))

@@ -18,8 +18,8 @@ from typing import Any
 from pxr import Ar, Sdf
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.blender import LAYERS, PACKAGE
 from advsearch.scene.importing.files import shown
+from advsearch.scene.importing.usd import LAYERS, PACKAGE
 from advsearch.trust import stored_files
 from advsearch.trust.named_files import is_inside
 from advsearch.trust.stored_files import LARGEST_FILE, check_most, scaled

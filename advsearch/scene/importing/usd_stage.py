@@ -22,10 +22,11 @@ from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 from advsearch.errors import FileFormatError
 from advsearch.scene.assets import face_vectors
 from advsearch.scene.glb import GlbBuffer
-from advsearch.scene.importing.blender import GENERATOR, PACKAGE
 from advsearch.scene.importing.files import SPLATS, check_faces
 from advsearch.scene.importing.geometry import triangulated
 from advsearch.scene.importing.gltf import DEEPEST_TREE, LARGEST_TREE
+from advsearch.scene.importing.gltf_entries import GENERATOR
+from advsearch.scene.importing.usd import PACKAGE
 from advsearch.scene.importing.usd_layers import check_layers, unpacked
 from advsearch.scene.importing.usd_surface import FIRST, BoundMaterial, Layout, PrimvarUse, UsdSurfaces
 from advsearch.trust.stored_files import check_most

@@ -1,0 +1,1 @@
+"""The built-in exporters, as `advsearch.catalog` lists them."""

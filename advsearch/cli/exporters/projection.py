@@ -1,0 +1,25 @@
+"""What a projector throws onto the object."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from advsearch.cli.output import at_work
+from advsearch.runs.exporters import Exported, Exporter
+
+
+class Projection(Exporter):
+    """A projector's picture, and marks to line it up."""
+
+    name = "projector"
+    writes = "a new folder"
+    example = "export mug-projector-001 --format projector --out folder"
+
+    def write(self, run: str, out: Path, options: Mapping[str, Any]) -> Exported:
+        with at_work(as_json=True, quiet=False):
+            from advsearch.api.projection import write_projection  # takes seconds
+
+            notes = write_projection(run, out)
+        return Exported({"notes": notes}, "\n".join([f"What to project is in {out}. Set:", *notes]))

@@ -1,0 +1,42 @@
+"""The adversarial scene or its object for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from advsearch.cli.output import at_work
+from advsearch.runs.exporters import Exported, Exporter
+
+
+class Gltf(Exporter):
+    """The adversarial object as glTF."""
+
+    name = "gltf"
+    writes = "a .glb file"
+    example = "export mug-texture-001 --format gltf --out mug.glb"
+    suffix = "glb"
+
+    def write(self, run: str, out: Path, options: Mapping[str, Any]) -> Exported:
+        with at_work(as_json=True, quiet=False):
+            from advsearch.api.export import write_gltf  # takes seconds
+
+            notes = write_gltf(run, out)
+        return Exported({"notes": notes}, " ".join([f"The object is in {out}.", *notes]))
+
+
+class MitsubaScene(Exporter):
+    """The adversarial scene for Mitsuba."""
+
+    name = "mitsuba"
+    writes = "an XML file and what belongs to it, or a new folder for them"
+    example = "export mug-texture-001 --format mitsuba --out folder"
+    suffix = "xml"
+
+    def write(self, run: str, out: Path, options: Mapping[str, Any]) -> Exported:
+        with at_work(as_json=True, quiet=False):
+            from advsearch.api.export import write_mitsuba  # takes seconds
+
+            notes = write_mitsuba(run, out)
+        return Exported({"notes": notes}, " ".join([f"The scene is in {out}.", *notes]))

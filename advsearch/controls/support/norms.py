@@ -1,0 +1,15 @@
+"""Norms of the balls in which searched pixels stay, and the radii of these."""
+
+from __future__ import annotations
+
+import math
+
+DEFAULT_EPSILON = 0.1
+"""Default radius of the L-infinity ball; the default L2 ball has the same root-mean-square change at its edge."""
+NORMS = ("linf", "l2")
+
+
+def radius(norm: str, epsilon: float | None, count: int) -> float:
+    """Return the radius of a ball over `count` colours, `DEFAULT_EPSILON` where none is given: in an L2 ball so large
+    that its edge has the same root-mean-square."""
+    return DEFAULT_EPSILON * (math.sqrt(count) if norm == "l2" else 1.0) if epsilon is None else float(epsilon)

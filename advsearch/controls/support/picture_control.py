@@ -1,0 +1,63 @@
+"""A control of a picture, which patches and projectors are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import NOTHING, Control, Value, changed
+from advsearch.controls.ranges import Fixed, Range, Spec
+from advsearch.errors import FileFormatError
+from advsearch.scene.importing.pictures import read_picture
+from advsearch.scene.settings import Parameter
+
+
+class PictureControl(Control):
+    """A control of a picture, searched or from a file, and of numbers, which are fixed where they are not given."""
+
+    shown: ClassVar[str]  # the parameter that is the picture
+    _picture: Tensor | None
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Rows and columns of the picture."""
+        return (int(self.chosen["resolution"]),) * 2
+
+    @property
+    def free(self) -> bool:
+        """Whether the picture is searched."""
+        return self.chosen["picture"] is None and not isinstance(self.specs.get(self.shown), Fixed)
+
+    def in_scene(self, parameter: Parameter) -> Parameter:
+        return replace(parameter, shape=(*self.sides, 3), default=0.0) if parameter.name == self.shown else parameter
+
+    def spec(self, parameter: Parameter) -> Spec:
+        picture = Range(0.0, 1.0) if self.free else Fixed(0.0)
+        return self.specs.get(parameter.name, picture if parameter.name == self.shown else Fixed(parameter.default))
+
+    def values(self, u: Tensor) -> dict[str, Tensor]:
+        values, picture = super().values(u), self._picture
+        shown = values[self.shown].reshape(*self.sides, 3) if picture is None else picture.to(u.device, copy=True)
+        return values | {self.shown: shown}
+
+    def read_picture(self) -> Tensor | None:
+        """Return the picture (h, w, 3) sRGB that was chosen; None where none was. Raises FileFormatError: it cannot be
+        read."""
+        if self.chosen["picture"] is None:
+            return None
+        try:
+            return torch.from_numpy(read_picture(Path(self.chosen["picture"])))
+        except FileFormatError as error:
+            raise FileFormatError(f"{self.name}.picture: {error}") from error
+
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
+        described = super().describe(u, so_far)
+        if not self.free:
+            return described
+        here, start = (self.values(at)[self.shown] for at in (u.detach(), self.start.to(u.device)))
+        return {**changed(self.name, here - start), **described}

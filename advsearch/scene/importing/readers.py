@@ -1,0 +1,56 @@
+"""Readers of mesh files by suffix, and converters of other files to glTF.
+
+A package outside adds its own reader (docs/extending.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from advsearch.catalog import list_built_ins
+from advsearch.registry import Registry, imported
+from advsearch.scene.importing.files import Notes, read_bytes
+from advsearch.scene.importing.parts import ImportedPart
+
+Reader = Callable[[Path, bytes, Notes], list[ImportedPart]]
+"""From a file, its content and what is said of it to its parts that have faces; raises as `objects.read_parts`."""
+
+READERS: Registry[Reader] = Registry(
+    "advsearch.readers",
+    list_built_ins("reader"),
+    "a function (path, data, notes) that returns a list of ImportedPart",
+    lambda name, entry: callable(entry) and name == name.lower(),
+)
+"""Readers by the suffix of their files, in lower case without the dot; imported when they are used."""
+
+_CONVERTERS = list_built_ins("converter")
+_READ_AS_GLTF = ("glb", "gltf", "vrm", *_CONVERTERS)
+GLTF = tuple(f".{name}" for name in _READ_AS_GLTF if name in (*READERS.own, *_CONVERTERS))
+"""Suffixes of glTF files, which have conventions of their own: y up, linear colours; and of what is read as glTF."""
+
+
+def list_suffixes() -> tuple[str, ...]:
+    """Return the suffixes of the files that an object can be read from, those of installed packages last."""
+    installed = [name for name in READERS if name not in READERS.own]
+    return tuple(f".{name}" for name in (*READERS.own, *_CONVERTERS, *installed))
+
+
+def get_reader(suffix: str) -> Reader:
+    """Return the reader of the files of a suffix, which is one of `list_suffixes`."""
+    name = suffix.removeprefix(".")
+    return READERS["glb" if name in _CONVERTERS else name]
+
+
+def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
+    """Return the content of a mesh or scene file; of one that is converted, such as a Blender file, as binary glTF.
+
+    Raises:
+        FileFormatError: as for `read_bytes`; or the file cannot be converted.
+    """
+    data = read_bytes(path, what, suffixes)
+    converter = _CONVERTERS.get(path.suffix.lower().removeprefix("."))
+    if converter is None:
+        return data
+    convert: Callable[[Path, bytes], bytes] = imported(converter.target)
+    return convert(path, data)
