@@ -1,0 +1,120 @@
+"""What an added experiment, control, task, policy, model source, reader or exporter may import from advsearch.
+
+    from advsearch.extend import Control, Parameter, Values
+
+Everything else in the package may change without notice. The built-in parts that the core does without use this module
+too, and nothing but it. A name is imported when it is first used, so that a control does not wait for the modules of
+an experiment. docs/extending.md has an example of each name.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from advsearch import seeds as seeds
+    from advsearch import statistics as statistics
+    from advsearch.attacks import Domain as Domain
+    from advsearch.attacks import Evaluation as Evaluation
+    from advsearch.attacks import Policy as Policy
+    from advsearch.attacks import Proposal as Proposal
+    from advsearch.config import SceneConfig as SceneConfig
+    from advsearch.controls.base import Choice as Choice
+    from advsearch.controls.base import Control as Control
+    from advsearch.controls.base import Parameter as Parameter
+    from advsearch.controls.base import Values as Values
+    from advsearch.controls.ranges import Fixed as Fixed
+    from advsearch.controls.ranges import OneOf as OneOf
+    from advsearch.controls.ranges import Range as Range
+    from advsearch.engine.problem import Problem as Problem
+    from advsearch.errors import FileFormatError as FileFormatError
+    from advsearch.errors import InputError as InputError
+    from advsearch.errors import ModelError as ModelError
+    from advsearch.errors import UnknownNameError as UnknownNameError
+    from advsearch.experiment import PositionalArgument as PositionalArgument
+    from advsearch.experiment import RunContext as RunContext
+    from advsearch.experiment import experiment as experiment
+    from advsearch.experiment import fail_check as fail_check
+    from advsearch.models import Model as Model
+    from advsearch.progress import Progress as Progress
+    from advsearch.questions.attack.settings import AttackConfig as AttackConfig
+    from advsearch.questions.sweep.settings import SweepConfig as SweepConfig
+    from advsearch.report import figures as figures
+    from advsearch.report import wording as wording
+    from advsearch.report.shown import Claim as Claim
+    from advsearch.report.shown import Column as Column
+    from advsearch.report.shown import InNotebook as InNotebook
+    from advsearch.report.shown import ResultPart as ResultPart
+    from advsearch.report.shown import ShownResult as ShownResult
+    from advsearch.runs.directory import RunDirectory as RunDirectory
+    from advsearch.runs.directory import find_run as find_run
+    from advsearch.runs.exporters import Exported as Exported
+    from advsearch.runs.exporters import Exporter as Exporter
+    from advsearch.runs.results import Fields as Fields
+    from advsearch.runs.results import Interval as Interval
+    from advsearch.runs.results import RunResult as RunResult
+    from advsearch.runs.store import Store as Store
+    from advsearch.runs.summary import read_result as read_result
+    from advsearch.scene import color as color
+    from advsearch.scene import geometry as geometry
+    from advsearch.scene.description import SceneDescription as SceneDescription
+    from advsearch.settings import Clash as Clash
+    from advsearch.settings import Config as Config
+    from advsearch.settings import setting as setting
+    from advsearch.settings import setting_as_in as setting_as_in
+    from advsearch.tasks import Facts as Facts
+    from advsearch.tasks import Judgement as Judgement
+    from advsearch.tasks import Prediction as Prediction
+    from advsearch.tasks import Task as Task
+
+_NAMES = {
+    "advsearch.attacks": ("Domain", "Evaluation", "Policy", "Proposal"),
+    "advsearch.config": ("SceneConfig",),
+    "advsearch.controls.base": ("Choice", "Control", "Parameter", "Values"),
+    "advsearch.controls.ranges": ("Fixed", "OneOf", "Range"),
+    "advsearch.engine.problem": ("Problem",),
+    "advsearch.errors": ("FileFormatError", "InputError", "ModelError", "UnknownNameError"),
+    "advsearch.experiment": ("PositionalArgument", "RunContext", "experiment", "fail_check"),
+    "advsearch.models": ("Model",),
+    "advsearch.progress": ("Progress",),
+    "advsearch.questions.attack.settings": ("AttackConfig",),
+    "advsearch.questions.sweep.settings": ("SweepConfig",),
+    "advsearch.report.shown": ("Claim", "Column", "InNotebook", "ResultPart", "ShownResult"),
+    "advsearch.runs.directory": ("RunDirectory", "find_run"),
+    "advsearch.runs.exporters": ("Exported", "Exporter"),
+    "advsearch.runs.results": ("Fields", "Interval", "RunResult"),
+    "advsearch.runs.store": ("Store",),
+    "advsearch.runs.summary": ("read_result",),
+    "advsearch.scene.description": ("SceneDescription",),
+    "advsearch.settings": ("Clash", "Config", "setting", "setting_as_in"),
+    "advsearch.tasks": ("Facts", "Judgement", "Prediction", "Task"),
+}
+"""The names of the interface, by the module that each is imported from."""
+
+_MODULES = {
+    "color": "advsearch.scene.color",
+    "figures": "advsearch.report.figures",
+    "geometry": "advsearch.scene.geometry",
+    "seeds": "advsearch.seeds",
+    "statistics": "advsearch.statistics",
+    "wording": "advsearch.report.wording",
+}
+"""Modules of functions that belong to the interface as a whole."""
+
+_MODULE_OF_NAME = {name: module for module, names in _NAMES.items() for name in names}
+
+__all__ = sorted({*_MODULE_OF_NAME, *_MODULES})
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of the interface on first use (PEP 562)."""
+    if name in _MODULES:
+        return import_module(_MODULES[name])
+    if name in _MODULE_OF_NAME:
+        return getattr(import_module(_MODULE_OF_NAME[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return list(__all__)
