@@ -189,6 +189,9 @@ class Experiment(Generic[AnyResult]):
         choices: "module:function" that returns the names that `about` may have, each with a line of help.
         view: ``result -> ShownResult``, what terminal, page and notebook show; None shows all fields.
         claims: ``result -> claims`` that a run supports, for `advsearch report`.
+        triggering: ``result -> lines``, conditions under which the model is wrong more often, for `advsearch report`.
+        noted_settings: ``(run, result) -> {kind: {name: settings}}`` of what a run tried beside its own settings, as it
+            noted them, for `advsearch report`; a kind is missing where its note cannot be read.
         page: ``(run, result) -> HTML or None``, for a page of its own kind.
         other_results: further classes of results, each by a field that it alone has.
     """
@@ -207,6 +210,8 @@ class Experiment(Generic[AnyResult]):
     choices: str = ""
     view: Callable[[Any], ShownResult] | None = None
     claims: Callable[[Any], Iterable[Claim]] | None = None
+    triggering: Callable[[Any], Iterable[str]] | None = None
+    noted_settings: Callable[[Path, Any], Mapping[str, Mapping[str, Mapping[str, Any]]]] | None = None
     page: Callable[[Path, Any], str | None] | None = None
     other_results: Mapping[str, type[Result]] = field(default_factory=dict)
 

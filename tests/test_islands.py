@@ -112,8 +112,6 @@ CORE_NOT_YET: frozenset[str] = frozenset(
         "advsearch/cli/show.py",
         "advsearch/engine/journal.py",
         "advsearch/questions/attack/carry_out.py",
-        "advsearch/questions/report/evidence.py",
-        "advsearch/questions/report/recorded.py",
         "advsearch/scene/cycles.py",
         "advsearch/scene/importing/usd_layers.py",
         "advsearch/scene/importing/usd_stage.py",

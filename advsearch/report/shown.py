@@ -114,13 +114,15 @@ class ResultPart:
 class ShownResult:
     """A result: what a reader should know first, in a sentence or two, the other sections, and by name what it was
     done with, beside what all questions have (environment, renders, time and seed). Cautions have to be known beside
-    the warnings; `about` is what it is of, in a few names, and empty: the object, the controls and the model."""
+    the warnings; `about` is what it is of, in a few names, and empty: the object, the controls and the model. Where
+    `says_interrupted`, `said` states by itself that an interrupted run was interrupted."""
 
     said: str
     sections: Sequence[ResultPart] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     about: Sequence[str] = ()
     cautions: Sequence[str] = ()
+    says_interrupted: bool = False
 
 
 def shown(result: Result) -> ShownResult:
@@ -131,7 +133,7 @@ def shown(result: Result) -> ShownResult:
 
 def remarks_of(result: Result, given: ShownResult) -> list[str]:
     ending = getattr(result, "ending", "")
-    unsaid = ending == INTERRUPTED and "nterrupted" not in given.said
+    unsaid = ending == INTERRUPTED and not given.says_interrupted
     stopped = ["Not finished: these are the results so far."] if unsaid else []
     stopped += ["It is running: this is what has come out so far."] if ending == RUNNING else []
     return [*stopped, *given.cautions, *getattr(result, "warnings", ())]

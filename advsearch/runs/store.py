@@ -102,6 +102,11 @@ class Store:
             check_schema(self._db, path, SCHEMA)
         self._closed: Callable[[], None] | None = None if read_only else note_open(path)
 
+    @classmethod
+    def open_to_read(cls, run: Path) -> Store:
+        """Open the results in a run directory for reading, beside a process that may write."""
+        return cls(run / NAME, read_only=True)
+
     def append(self, rows: Sequence[Row], told: Told | None = None) -> None:
         """Add rows in one transaction; they survive a kill of the process when this returns, and where the disk is full
         none of them is kept. A row whose kind and step are there already changes nothing. What it `told` is that of the

@@ -253,7 +253,7 @@ def test_every_setting_of_a_scene_has_its_part_of_a_domain(name: str) -> None:
     assert part_of_domain(name) in (*DOMAIN, OTHER)
     result = samples.attack(controls=["geometry"], over=[])
     domain = domain_of(result, own({"set": {name: 1.5}}), [])
-    assert any(f"{name} 1.5" in text for text in domain.values()) or part_of_domain(name) == "surfaces"
+    assert any(f"{name} 1.5" in part.text for part in domain.values()) or part_of_domain(name) == "surfaces"
 
 
 def test_a_criterion_is_pooled_over_what_was_drawn_only() -> None:

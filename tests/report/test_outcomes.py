@@ -107,7 +107,7 @@ def test_a_frame_of_rows_has_the_outcome() -> None:
 
 def test_claims_say_how_a_detector_fails() -> None:
     found = attack(task="detection", ending="found", verified=rated(labels={"no cup": 20}, outcomes={"missed": 20}))
-    verdict, reason = search_verdict(found, AttackConfig(object="mug"))
+    verdict, reason, _ = search_verdict(found, AttackConfig(object="mug"))
     assert verdict == FAILED and reason.endswith(": 20 missed") and "a no cup" not in reason
     interval = clopper_pearson(0, 8)
     reason = tried_reason(FAILED, (0, 8, 0), "no cup", interval, over=False, outcomes="8 missed")

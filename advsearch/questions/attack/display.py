@@ -79,7 +79,7 @@ def _shown_attack(summary: AttackSummary) -> ShownResult:
         "environment": "",  # the page has it, and the seed
         "seed": "",
     }
-    return ShownResult(wording.attack_verdict(summary), sections, facts, cautions=cautions)
+    return ShownResult(wording.attack_verdict(summary), sections, facts, cautions=cautions, says_interrupted=True)
 
 
 def _rates(summary: AttackSummary) -> ResultPart:

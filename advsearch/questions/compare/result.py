@@ -172,7 +172,8 @@ def shown(result: CompareResult) -> ShownResult:
         sections += _of_pair(pair, several=len(result.pairs) > 1)
     said = headline(result.pairs[0]) if result.pairs else "Interrupted before anything was compared."
     sweeps = ", ".join(dict.fromkeys(one.run for one in result.sides))
-    return ShownResult(said, sections, {"sweeps": sweeps, "they differ in": ", ".join(result.differ)})
+    facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
+    return ShownResult(said, sections, facts, says_interrupted=not result.pairs)
 
 
 def headline(pair: ComparedPair) -> str:

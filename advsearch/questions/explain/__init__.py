@@ -8,7 +8,7 @@ from typing import ClassVar
 from advsearch.config import SceneConfig
 from advsearch.errors import InputError
 from advsearch.experiment import PositionalArgument, RunContext, experiment
-from advsearch.questions.explain.result import ExplainResult, RuleRow, claims, shown
+from advsearch.questions.explain.result import ExplainResult, RuleRow, claims, shown, triggering
 from advsearch.runs.directory import PARTS, find_run
 from advsearch.runs.results import INTERRUPTED
 from advsearch.runs.summary import read_result
@@ -64,6 +64,7 @@ class ExplainConfig(Config):
     positional=PositionalArgument("RUN", "the run of a sweep", "", True),
     view=shown,
     claims=claims,
+    triggering=triggering,
 )
 def explain(asked: RunContext[ExplainConfig]) -> ExplainResult:
     """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).

@@ -217,6 +217,15 @@ def rule_text(number: int, rule: RuleRow) -> str:
     return f"{text} Fresh renders inside it: right in {rule.confirmed.text}; {verdict}."
 
 
+def triggering(result: ExplainResult) -> Iterator[str]:
+    """Yield the rules in words, and whether fresh renders confirm each."""
+    for number, rule in enumerate(result.rules, start=1):
+        state = "Counted on rows that did not choose it, not rendered"
+        if rule.confirmed is not None:
+            state = "Confirmed" if rule.confirmed.held else "Not confirmed"
+        yield f"{state}: {rule_text(number, rule)}"
+
+
 def not_told_text(result: ExplainResult) -> str:
     """Return the best rule that is not told, why not, and how many rows it would take; empty where there is none."""
     rule = result.not_told

@@ -6,36 +6,34 @@ import json
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timezone
+from enum import Enum
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
-from advsearch import __version__, registry
+from advsearch import __version__
 from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
-from advsearch.questions.attack import wording as attack_wording
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.explain.result import ExplainResult, rule_text
 from advsearch.questions.photographs.result import FOLDER, PHOTO, PhotoAgreement
 from advsearch.questions.report.recorded import (
-    SUITE,
+    CLAIM,
     RecordedSettings,
     attacks_read,
     made_with,
-    noted,
+    noted_settings,
     own_settings,
     recorded_settings,
     stated,
     sweeps_read,
-    tried_claims,
 )
 from advsearch.questions.report.result import ConditionShare, Evidence, EvidenceRun
 from advsearch.questions.sweep.summary import AxisValue, SweepSummary
-from advsearch.questions.test.result import SuiteResult
+from advsearch.registry import get_experiment
 from advsearch.report import wording
-from advsearch.report.shown import Claim, claim, counted, nothing_claimed, share_text
+from advsearch.report.shown import Claim, claim, counted, nothing_claimed, share_text, shown
 from advsearch.report.wording import interval_text, number_text, percent
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, typed_name
 from advsearch.runs.results import RUNNING, Interval, Result, VariedValue
@@ -101,13 +99,8 @@ def _has(value: float | str, of: AxisValue) -> bool:
 
 
 def triggering_conditions(result: Result) -> list[str]:
-    rules, lines = result.rules if isinstance(result, ExplainResult) else [], []
-    for number, rule in enumerate(rules, start=1):
-        state = "Counted on rows that did not choose it, not rendered"
-        if rule.confirmed is not None:
-            state = "Confirmed" if rule.confirmed.held else "Not confirmed"
-        lines.append(f"{state}: {rule_text(number, rule)}")
-    return lines
+    triggering = get_experiment(result.command).triggering
+    return [] if triggering is None else list(triggering(result))
 
 
 def met(criterion: float, interval: Interval) -> str:
@@ -201,8 +194,27 @@ def exposure_lines(result: Result, conditions: Sequence[ConditionShare], exposur
     return lines
 
 
-def domain_of(result: Result, recorded: Sequence[RecordedSettings], searched: Sequence[str]) -> dict[str, str]:
-    """Return what an operational design domain consists of, in words: within what each part varied, or what it was."""
+class Variation(Enum):
+    """Whether a part of an operational design domain varied."""
+
+    VARIED = ""
+    WITH_PLACE = "as each environment has it"
+    FIXED = "not varied"
+
+
+class DomainPart(NamedTuple):
+    """What a part of an operational design domain was, in words, and whether that varied."""
+
+    variation: Variation
+    description: str
+
+    @property
+    def text(self) -> str:
+        return ": ".join(filter(None, (self.variation.value, self.description)))
+
+
+def domain_of(result: Result, recorded: Sequence[RecordedSettings], searched: Sequence[str]) -> dict[str, DomainPart]:
+    """Return the parts of an operational design domain by name: within what each varied, or what it was."""
     fixed = defaultdict[str, list[str]](list)
     fixed["place"].append(str(getattr(result, "environment", "") or stated(recorded, "environment")))
     things = filter(None, (str(getattr(result, "object", "") or ""), stated(recorded, "things")))
@@ -217,18 +229,21 @@ def domain_of(result: Result, recorded: Sequence[RecordedSettings], searched: Se
     for name, value in values:
         fixed[part_of_domain(name)].append(f"{name} {value}")
     moving = [*getattr(result, "controls", ()), *getattr(result, "over", ())]
-    domain = dict[str, str]()
+    domain = dict[str, DomainPart]()
     for part in (*DOMAIN, OTHER):
         varied = [line for line in searched if part_of_domain(line) == part]
         varied = varied or [name for name in moving if part_of_domain(name) == part]
         for drive in (getattr(result, "drives", None) or [])[:1] if part == "ways and speeds" else ():
             varied.append(f"{drive.drives} drives of {drive.seconds:g} s, {drive.frames} frames each")
         was = "; ".join(filter(None, fixed[part]))
-        if part != OTHER or varied or was:
-            domain[part] = "; ".join(varied) or (f"not varied: {was}" if was else "not varied")
-    if not domain["place"].startswith("not varied"):
+        if varied:
+            domain[part] = DomainPart(Variation.VARIED, "; ".join(varied))
+        elif part != OTHER or was:
+            domain[part] = DomainPart(Variation.FIXED, was)
+    if domain["place"].variation is Variation.VARIED:
         for part in ("light", "weather"):
-            domain[part] = domain[part].replace("not varied", "as each environment has it")
+            if domain[part].variation is Variation.FIXED:
+                domain[part] = domain[part]._replace(variation=Variation.WITH_PLACE)
     return domain
 
 
@@ -261,7 +276,7 @@ def claims_of(result: Result) -> list[Claim]:
     if result.goes_on:
         state = "is running" if getattr(result, "ending", "") == RUNNING else "is not finished"
         return [nothing_claimed(f"the run {state}" + (f"; so far: {result.brief}" if result.brief else ""))]
-    if claims := registry.get_experiment(result.command).claims:
+    if claims := get_experiment(result.command).claims:
         return list(claims(result)) or [nothing_claimed("nothing in this run came to its end")]
     return [nothing_claimed(f"the command {result.command} does not measure how often a model is right")]
 
@@ -339,7 +354,7 @@ def evidence_of(
 def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
     lines = []
     if isinstance(result, AttackSummary):
-        lines.append(attack_wording.changed_text(result))
+        lines.append(shown(result).facts["changed"])
         lines += [
             f"{name}: {found.low:.4g} to {found.high:.4g} {found.unit}".rstrip()
             for name, found in (result.configuration or {}).items()
@@ -405,7 +420,7 @@ def _measured(result: Result, settings: Mapping[str, object], recorded: Sequence
 def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
     lines = ["Nothing varied but what stands under What varied, and the noise of the renders."]
     if isinstance(result, AttackSummary):
-        lines += [remark for remark in attack_wording.remarks(result) if remark not in result.warnings]
+        lines += shown(result).cautions
         bad = result.non_finite
         if bad.objectives or bad.gradient_elements:
             lines.append(f"Not finite: {bad.objectives} objectives, {bad.gradient_elements} numbers of gradients.")
@@ -440,12 +455,12 @@ def collected(
     for number, folder in enumerate(folders.values(), 1):
         files = [folder / IMAGES / f"{name}.png" for name in PICTURES]
         files = [file for file in files if file.is_file() and not file.is_symlink()][:3]
-        shown = {f"pictures/{number}-{file.name}": read_bytes(file, "a picture", MOST_OF_PICTURE) for file in files}
-        pictures |= shown
+        own = {f"pictures/{number}-{file.name}": read_bytes(file, "a picture", MOST_OF_PICTURE) for file in files}
+        pictures |= own
         run, begun = _run(folder, criterion, exposure or {}), ""
         with suppress(OSError):  # when its settings were written
             begun = f"{datetime.fromtimestamp((folder / CONFIG).stat().st_mtime, timezone.utc):%Y-%m-%d %H:%M} UTC"
-        told.append(run.model_copy(update={"pictures": list(shown), "begun": begun}))
+        told.append(run.model_copy(update={"pictures": list(own), "begun": begun}))
         if model := run.about.get("Model"):
             of_model = model, model.rpartition("@")[2]
             models.append(model)
@@ -494,8 +509,8 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
         with suppress(AdvsearchError):
             basis.append((read_result(path), own_settings(path)))
     searched = list(dict.fromkeys(line for one in basis for line in searched_lines(*one)))
-    if isinstance(result, SuiteResult):
-        searched = _of_a_suite(noted(folder, SUITE), tried_claims(result))
+    if (noted_parts := noted_settings(folder, result)) is not None:
+        searched = _searched_by_claims(noted_parts.get(CLAIM))
     searched = searched or run.searched
     domain = domain_of(basis[0][0] if basis else result, recorded, searched)
     chosen = list(dict.fromkeys(axis for one in (result, *(swept for swept, _ in basis)) for axis in chosen_axes(one)))
@@ -504,7 +519,7 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
     compared = sum(claim.extent.total for claim in photographs if claim.extent)
     photographed = f"Only {compared} photographs were" if compared else "No photograph was"
     not_shown = [f"{photographed} compared with renderings: all else is about renderings."]
-    if still := [part for part, text in domain.items() if text.startswith("not varied")]:
+    if still := [name for name, part in domain.items() if part.variation is Variation.FIXED]:
         not_shown.append(f"Nothing is said of other values of: {', '.join(still)}.")
     not_shown.append(WEIGHTED if weighted else NOT_WEIGHTED)
     more = {
@@ -515,27 +530,24 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
         "exposure": weighted,
         "conditions": conditions,
         "photographs": conditions_of(result, rows),
-        "domain": domain,
+        "domain": {name: part.text for name, part in domain.items()},
         "not_shown": not_shown,
     }
     return run.model_copy(update=more)
 
 
-def _of_a_suite(suite: Any, tried: Collection[str]) -> list[str]:
-    lines = defaultdict[str, list[str]](list)
-    try:
-        for name, claim in suite["claims"].items():
-            if name not in tried:
-                continue
-            settings = {**suite["settings"], **claim["settings"]}
-            controls = settings.get("controls") or {}
-            if not isinstance(controls, Mapping):
-                controls = dict.fromkeys(str(controls).split(","))
-            for control, given in controls.items():
-                text = json.dumps(given, ensure_ascii=False) if given else "everything it searches by default"
-                lines[f"{control}: {text}"].append(str(name))
-            if settings.get("environment"):
-                lines[f"environment: {settings['environment']}"].append(str(name))
-    except (KeyError, AttributeError, TypeError, ValueError):
+def _searched_by_claims(claims: Mapping[str, Mapping[str, Any]] | None) -> list[str]:
+    """Return what varied in the claims of a suite, by the settings of each; None for settings that can't be read."""
+    if claims is None:
         return ["as the claims of its suite say, which cannot be read any more"]
+    lines = defaultdict[str, list[str]](list)
+    for name, settings in claims.items():
+        controls = settings.get("controls") or {}
+        if not isinstance(controls, Mapping):
+            controls = dict.fromkeys(str(controls).split(","))
+        for control, given in controls.items():
+            text = json.dumps(given, ensure_ascii=False) if given else "everything it searches by default"
+            lines[f"{control}: {text}"].append(name)
+        if settings.get("environment"):
+            lines[f"environment: {settings['environment']}"].append(name)
     return [f"{line} ({', '.join(names)})" for line, names in lines.items()]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -13,7 +13,7 @@ from typing import Any
 from advsearch.config import CONFIGS
 from advsearch.errors import AdvsearchError
 from advsearch.options import FROM_RUN
-from advsearch.questions.test.result import NOT_TRIED, NOT_YET, SuiteResult
+from advsearch.registry import get_experiment
 from advsearch.report.wording import number_text
 from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, typed_name
 from advsearch.runs.results import Result
@@ -23,8 +23,7 @@ from advsearch.runs.summary import MADE_WITH
 from advsearch.settings import Config, read_yaml, settings
 from advsearch.settings.configuration import PLACE
 
-SUITE = "suite"  # the note of a run of `test` that has its claims
-COUNTEREXAMPLES = "counterexamples"  # its note that has their settings, by name
+CLAIM = "claim"  # the kind of settings that a suite noted for each of its claims
 NOT_SETTINGS = ("schema", "command", "base", *PLACE)
 ATTACKS = ("attack", "adversarial_of", "around")  # settings that name an attack's run
 DEFAULT_TASK = "classification"
@@ -151,39 +150,20 @@ def _found(names: Iterable[object]) -> list[Path]:
 def recorded_settings(folder: Path, result: Result, read: Sequence[Path]) -> list[RecordedSettings]:
     """Return the settings of a run: its own, of a suite those of each claim and counterexample that was tried, and
     those of the runs that it read."""
-    own = own_settings(folder)
-    recorded = [RecordedSettings("", own)]
-    if isinstance(result, SuiteResult):
-        tried = tried_claims(result)
-        recorded += _of_suite(noted(folder, SUITE), tried)
-        recorded += _of_counterexamples(noted(folder, COUNTEREXAMPLES), tried)
+    recorded = [RecordedSettings("", own_settings(folder))]
+    for kind, settings_by_name in (noted_settings(folder, result) or {}).items():
+        recorded += [RecordedSettings(f"{kind} {name}", values) for name, values in settings_by_name.items()]
     return recorded + [RecordedSettings(typed_name(path), own_settings(path)) for path in read]
 
 
-def tried_claims(result: SuiteResult) -> set[str]:
-    return {claim.name for claim in result.claims if claim.reason not in (NOT_TRIED, NOT_YET)}
-
-
-def _of_suite(suite: Any, tried: Collection[str]) -> list[RecordedSettings]:
-    recorded = list[RecordedSettings]()
-    with suppress(KeyError, AttributeError, TypeError, ValueError):
-        common = {name: suite[name] for name in ("seed", "confidence") if name in suite}
-        for name, claim in suite["claims"].items():
-            of_claim = {key: value for key, value in claim.items() if key != "settings"}
-            values = {**common, **suite["settings"], **of_claim, **claim["settings"]}
-            if name in tried:
-                recorded.append(RecordedSettings(f"claim {name}", values))
-    return recorded
-
-
-def _of_counterexamples(examples: Any, tried: Collection[str]) -> list[RecordedSettings]:
-    if not isinstance(examples, Mapping):
-        return []
-    return [
-        RecordedSettings(f"counterexample {name}", values)
-        for name, values in examples.items()
-        if name in tried and isinstance(values, Mapping)
-    ]
+def noted_settings(folder: Path, result: Result) -> Mapping[str, Mapping[str, Mapping[str, Any]]] | None:
+    """Return what a run noted of settings beside its own, by kind and name; None for an experiment that notes none."""
+    hook = get_experiment(result.command).noted_settings
+    if hook is None:
+        return None
+    with suppress(AdvsearchError):
+        return hook(folder, result)
+    return {}
 
 
 def stated(recorded: Iterable[RecordedSettings], name: str, otherwise: str = "") -> str:

@@ -208,7 +208,9 @@ def shown(summary: SweepSummary) -> ShownResult:
         "worst drive": f"{summary.run}/images/drive.webp" if summary.drives and summary.run else "",
         "map of the surface": f"{summary.run}/images/surface.png" if summary.surface else "",
     }
-    return ShownResult(_verdict(summary), sections, facts)
+    counted = summary.configurations > 0
+    ended_early = not summary.out_of_view if not counted else summary.looked_at < summary.planned
+    return ShownResult(_verdict(summary), sections, facts, says_interrupted=ended_early)
 
 
 def _page_parts(summary: SweepSummary, axes: Mapping[str, Sequence[AxisRow]]) -> Iterator[ResultPart]:

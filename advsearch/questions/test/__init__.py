@@ -7,6 +7,7 @@ from pathlib import Path
 from advsearch.errors import InputError
 from advsearch.experiment import PositionalArgument, RunContext, experiment
 from advsearch.questions.test import result as results
+from advsearch.questions.test.recorded import noted_settings
 from advsearch.questions.test.result import SuiteResult
 from advsearch.questions.test.settings import Suite, SuiteConfig
 
@@ -26,6 +27,7 @@ FORMATS = {"junit": results.junit, "sarif": results.sarif, "markdown": results.m
     exit_status=lambda result: result.status,
     view=results.shown,
     claims=results.claims,
+    noted_settings=noted_settings,
 )
 def test(context: RunContext[SuiteConfig], suite: Suite | None = None) -> SuiteResult:
     """Try the claims of a suite, counterexamples first, and write the files for other programs (docs/testing.md).

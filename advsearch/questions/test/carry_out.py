@@ -21,16 +21,23 @@ from advsearch.questions.attack.carry_out import check_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.test.claims import Trial, check_pictures
 from advsearch.questions.test.counterexamples import Counterexample
-from advsearch.questions.test.result import FAILED, NOT_TRIED, NOT_YET, STOPPED, TIME_OVER, ClaimResult, SuiteResult
+from advsearch.questions.test.recorded import SETTINGS_NOTE, SUITE_NOTE
+from advsearch.questions.test.result import (
+    FAILED,
+    NOT_TRIED,
+    NOT_YET,
+    STOPPED,
+    TIME_OVER,
+    Cause,
+    ClaimResult,
+    SuiteResult,
+)
 from advsearch.questions.test.settings import COUNTEREXAMPLES, NotBrokenClaim, NoWorseClaim, Suite, SuiteConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.viewer.pages import keep_result
-
-NOTE = "suite"  # under which a run's store keeps the suite with its seed, so that it goes on as it began
-SETTINGS_NOTE = "counterexamples"  # under which it keeps what counterexamples are judged with, by name
 
 
 @dataclass(frozen=True)
@@ -55,7 +62,7 @@ def test_from_config(
     noted = None
     if resumed is not None and (resumed / STORE).is_file():  # a run that was stopped at once has noted no suite
         with Store(resumed / STORE, read_only=True) as store:
-            noted = store.noted(NOTE)
+            noted = store.noted(SUITE_NOTE)
     described = suites.suite_of(noted, f"{resumed}: the suite that it began with") if noted is not None else suite
     if described is None:
         described = suites.read_suite(config.suite)
@@ -72,7 +79,7 @@ def test_from_config(
             beside.remove(added)
         raise InputError(f"{config.suite}: {error}") from None
     with RunDirectory.of(config, resumed) as run:
-        run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
+        run.store.set_note(SUITE_NOTE, json.dumps(described.model_dump(mode="json")))
         judged_with = {claim.name: claim.config.deciding() for claim in planned if claim.example is not None}
         run.store.set_note(SETTINGS_NOTE, json.dumps(judged_with))
         for claim in planned:
@@ -111,11 +118,12 @@ class _SuiteRun:
                         trial.run.write_summary(self.result(INTERRUPTED, None))  # what a kill leaves
         except KeyboardInterrupt:
             for claim in self.planned[len(self.results) :]:
-                self._add(claim, self._not_tried(claim, STOPPED))
+                self._add(claim, self._not_tried(claim, STOPPED, Cause.INTERRUPTED))
             return INTERRUPTED
-        if any(tried.reason == NOT_TRIED for tried in self.results):
+        causes = {tried.cause for tried in self.results}
+        if Cause.COUNTEREXAMPLE_FAILED in causes:
             trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
-        return OUT_OF_TIME if any(TIME_OVER in tried.reason for tried in self.results) else "done"
+        return OUT_OF_TIME if Cause.OUT_OF_TIME in causes else "done"
 
     def _tried(self, claim: PlannedClaim, results: Results) -> ClaimResult:
         key, trial = f"claim {claim.name}", self.trial
@@ -123,9 +131,9 @@ class _SuiteRun:
             return ClaimResult.of(stored)
         failed = any(known.kind == "counterexample" and not known.accepted for known in self.results)
         if failed and claim.example is None and not trial.config.all:
-            return self._not_tried(claim, NOT_TRIED)
+            return self._not_tried(claim, NOT_TRIED, Cause.COUNTEREXAMPLE_FAILED)
         if trial.late:
-            return self._not_tried(claim, f"{TIME_OVER} before it began")
+            return self._not_tried(claim, f"{TIME_OVER} before it began", Cause.OUT_OF_TIME)
         if claim.refusal:
             return self._not_tried(claim, claim.refusal)
         asked, begun = self._not_tried(claim, ""), time.perf_counter()
@@ -134,16 +142,18 @@ class _SuiteRun:
         else:
             assert isinstance(claim.config, AttackConfig)
             tried = trial.counterexample(asked, claim.example, claim.config)
-        if tried.reason == STOPPED:
+        if tried.cause is Cause.INTERRUPTED:
             raise KeyboardInterrupt
         tried = tried.model_copy(update={"seconds": time.perf_counter() - begun})
-        if TIME_OVER not in tried.reason:
+        if tried.cause is not Cause.OUT_OF_TIME:
             results.put(key, tried.to_dict())
         return tried
 
-    def _not_tried(self, claim: PlannedClaim, reason: str) -> ClaimResult:
+    def _not_tried(self, claim: PlannedClaim, reason: str, cause: Cause | None = None) -> ClaimResult:
         text = room.statement(self.trial.suite.claims[claim.name], claim.config) if claim.example is None else ""
-        return ClaimResult(name=claim.name, kind=claim.kind, statement=text, answer=room.UNDECIDED, reason=reason)
+        return ClaimResult(
+            name=claim.name, kind=claim.kind, statement=text, answer=room.UNDECIDED, reason=reason, cause=cause
+        )
 
     def _add(self, claim: PlannedClaim, tried: ClaimResult) -> None:
         no = {"add": None, "run": None, "junit": None, "sarif": None, "markdown": None}
@@ -159,9 +169,10 @@ class _SuiteRun:
     def result(self, ending: str, added: Counterexample | None) -> SuiteResult:
         config, suite = self.trial.config, self.trial.suite
         configs, changes = [claim.config for claim in self.planned], list[str]()
-        results = [*self.results, *(self._not_tried(claim, NOT_YET) for claim in self.planned[len(self.results) :])]
+        ahead = self.planned[len(self.results) :]
+        results = [*self.results, *(self._not_tried(claim, NOT_YET, Cause.NOT_REACHED) for claim in ahead)]
         if config.update and ending == "done":
-            now = {tried.name: tried.answer for tried in results if NOT_TRIED not in tried.reason}
+            now = {tried.name: tried.answer for tried in results if tried.cause is not Cause.COUNTEREXAMPLE_FAILED}
             changes = beside.write_expected(config.suite, now)
             results = [tried.model_copy(update={"expected": now.get(tried.name, tried.expected)}) for tried in results]
         return SuiteResult(

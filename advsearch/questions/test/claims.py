@@ -39,7 +39,7 @@ from advsearch.questions.test.counterexamples import (
     outcome_of,
     scene_digest,
 )
-from advsearch.questions.test.result import FAILED, HELD, TIME_OVER, UNDECIDED, ClaimResult
+from advsearch.questions.test.result import FAILED, HELD, TIME_OVER, UNDECIDED, Cause, ClaimResult
 from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim, ShareClaim
 from advsearch.report.wording import number_text, outcomes_text
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
@@ -89,10 +89,11 @@ class Trial:
         summary = carry_out_part(self.run.path / PARTS / asked.name, own, self.progress)
         assert isinstance(summary, AttackSummary)
         self.warnings += summary.warnings
-        verdict, reason = words.search_verdict(summary, own.model_copy(update={"steps": own.steps or summary.steps}))
+        planned = own.model_copy(update={"steps": own.steps or summary.steps})
+        verdict, reason, cause = words.search_verdict(summary, planned)
         shown = "clean" if summary.ending == "already wrong" else "adversarial"
         file = f"{PARTS}/{asked.name}/{IMAGES}/{shown}.png"
-        outcome: dict[str, Any] = {"answer": verdict, "reason": reason, "part": asked.name}
+        outcome: dict[str, Any] = {"answer": verdict, "reason": reason, "cause": cause, "part": asked.name}
         outcome["pictures"] = sum(count for name, count in summary.renders.items() if name != "products")
         outcome["picture"] = file if verdict == FAILED and (self.run.path / file).is_file() else None
         return asked.model_copy(update=outcome)
@@ -149,8 +150,10 @@ class Trial:
                 outcomes = outcomes_text(count_outcomes(wrong_payloads), problem.task.name)
             reason = words.share_reason(what, verdict, values.count(1.0), len(values), interval, example, outcomes)
         reason += f"; the object is not to be seen in {hidden} more, which are not counted" if hidden else ""
-        reason += f"; {TIME_OVER}" if verdict == UNDECIDED and self.late else ""
-        outcome = {"answer": verdict, "reason": reason, "pictures": len(values), "spp": spp, "interval": interval}
+        cause = Cause.OUT_OF_TIME if verdict == UNDECIDED and self.late else None
+        reason += f"; {TIME_OVER}" if cause is Cause.OUT_OF_TIME else ""
+        outcome = {"answer": verdict, "reason": reason, "cause": cause, "pictures": len(values), "spp": spp}
+        outcome["interval"] = interval
         outcome["rate"] = mean if values else None
         outcome["picture"] = self._picture(asked.name, problem, worst[1]) if worst else None
         return asked.model_copy(update=outcome)
@@ -243,9 +246,11 @@ class Trial:
         counts = (right, wrong, outcomes.count(None))
         became = outcomes_text(count_outcomes(wrong_payloads), problem.task.name)
         reason = words.tried_reason(verdict, counts, label, interval, over=over, outcomes=became)
+        outcome: dict[str, Any] = {"pictures": len(outcomes), "spp": example.spp}
         if self.late and right + wrong < count and not (right and wrong and not over):
             verdict, reason = UNDECIDED, f"{reason}; {TIME_OVER}" if outcomes else TIME_OVER
-        outcome = {"answer": verdict, "reason": reason, "pictures": len(outcomes), "spp": example.spp}
+            outcome["cause"] = Cause.OUT_OF_TIME
+        outcome |= {"answer": verdict, "reason": reason}
         outcome |= {"picture": picture, "rate": right / (right + wrong) if right + wrong else None}
         return asked.model_copy(update={**outcome, "interval": interval})
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Sequence
+from enum import Enum
 from pathlib import Path
 from typing import ClassVar
 from urllib.parse import quote
@@ -36,6 +37,15 @@ VERDICTS = (HELD, UNDECIDED, FAILED)  # from the best to the worst
 STATUS = {HELD: 0, FAILED: 1, UNDECIDED: 2}  # exit status of the command, by what the suite says as a whole
 
 
+class Cause(str, Enum):
+    """Why a claim is undecided, where its pictures are not the reason."""
+
+    COUNTEREXAMPLE_FAILED = "counterexample failed"
+    INTERRUPTED = "interrupted"
+    NOT_REACHED = "not reached"
+    OUT_OF_TIME = "out of time"
+
+
 class ClaimResult(Fields):
     """One claim, or one counterexample, and what came out."""
 
@@ -60,6 +70,9 @@ class ClaimResult(Fields):
     part: str | None = optional("the run in `parts` that has the search; absent without one")
     repeat: str = Field("", description="the command that repeats it; absent where there is none")
     seconds: JsonFloat = Field(0.0, description="that it took")
+    cause: Cause | None = optional(
+        "`counterexample failed`, `interrupted`, `not reached` or `out of time`: why it is undecided; absent elsewhere"
+    )
 
     @property
     def accepted(self) -> bool:
@@ -116,7 +129,7 @@ def shown(result: SuiteResult) -> ShownResult:
     runs = [claim.part for claim in result.claims]
     sections = [ResultPart("The claims", heads=TABLE_HEADS, rows=table_rows(result), note=NOTE, parts=runs)]
     for claim in result.claims:
-        if claim.answer != HELD and claim.reason != NOT_TRIED:
+        if claim.answer != HELD and claim.cause is not Cause.COUNTEREXAMPLE_FAILED:
             caption = f"{claim.statement}: {claim.answer}. {claim.reason}."
             pictures = [[Picture(claim.picture, caption)]] if claim.picture else []
             sections.append(ResultPart(claim.name, rows=[["repeat", claim.repeat]], pictures=pictures))
@@ -170,28 +183,31 @@ def difference_reason(verdict: str, counts: tuple[int, int, int], interval: tupl
     return said + (f"; not decided after {count(pictures, 'picture')}" if verdict == UNDECIDED else "")
 
 
-def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, str]:
+def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, str, Cause | None]:
+    """Return the verdict of a search, its reason, and the cause where the search is not at its end."""
     verified, clean = summary.verified, summary.clean.control
     if summary.ending == "already wrong":
         right = "" if clean is None else f": right in {clean.correct} of {clean.trials} trials"
         if clean is not None and clean.outcomes:
             right += f", {outcomes_text(clean.outcomes, summary.task)}"
-        return FAILED, f"wrong on the clean scene already{right}"
+        return FAILED, f"wrong on the clean scene already{right}", None
     if summary.ending == "found" and verified is not None:
         called = how_wrong(summary.task, verified)
         wrong = (
             f"wrong in {verified.successes} of {verified.trials} trials (interval {interval_text(verified.interval)})"
         )
-        return FAILED, f"a verified counterexample: {wrong}{called}"
+        return FAILED, f"a verified counterexample: {wrong}{called}", None
     if summary.goes_on:
-        return UNDECIDED, STOPPED
+        return UNDECIDED, STOPPED, Cause.INTERRUPTED
     if verified is not None and verified.successes:
-        return UNDECIDED, f"what it found is wrong in {verified.successes} of {verified.trials} trials, by noise"
+        noisy = f"what it found is wrong in {verified.successes} of {verified.trials} trials, by noise"
+        return UNDECIDED, noisy, None
     asked = config.steps
     if config.seconds is not None and asked is not None and summary.steps < asked:
-        return UNDECIDED, f"{TIME_OVER} after {summary.steps} of {asked} steps"
+        return UNDECIDED, f"{TIME_OVER} after {summary.steps} of {asked} steps", Cause.OUT_OF_TIME
     beside = "" if summary.baseline is None else ", nor by as many random renders"
-    return HELD, f"not broken by {count(summary.steps, 'step')} of {summary.policy}{beside}; this is no proof"
+    steps = count(summary.steps, "step")
+    return HELD, f"not broken by {steps} of {summary.policy}{beside}; this is no proof", None
 
 
 def how_wrong(task: str, verified: VerifiedRate) -> str:
