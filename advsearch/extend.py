@@ -12,9 +12,13 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from advsearch import __version__ as __version__
+
 if TYPE_CHECKING:
     from advsearch import seeds as seeds
+    from advsearch import settings as settings
     from advsearch import statistics as statistics
+    from advsearch.api import problems as problems
     from advsearch.attacks import Domain as Domain
     from advsearch.attacks import Evaluation as Evaluation
     from advsearch.attacks import Policy as Policy
@@ -45,8 +49,10 @@ if TYPE_CHECKING:
     from advsearch.report.shown import Claim as Claim
     from advsearch.report.shown import Column as Column
     from advsearch.report.shown import InNotebook as InNotebook
+    from advsearch.report.shown import Picture as Picture
     from advsearch.report.shown import ResultPart as ResultPart
     from advsearch.report.shown import ShownResult as ShownResult
+    from advsearch.runs import results as results
     from advsearch.runs.directory import RunDirectory as RunDirectory
     from advsearch.runs.directory import find_run as find_run
     from advsearch.runs.exporters import Exported as Exported
@@ -67,6 +73,8 @@ if TYPE_CHECKING:
     from advsearch.tasks import Judgement as Judgement
     from advsearch.tasks import Prediction as Prediction
     from advsearch.tasks import Task as Task
+    from advsearch.trust import stored_files as stored_files
+    from advsearch.trust import writing as writing
 
 _NAMES = {
     "advsearch.attacks": ("Domain", "Evaluation", "Policy", "Proposal"),
@@ -80,7 +88,7 @@ _NAMES = {
     "advsearch.progress": ("Progress",),
     "advsearch.questions.attack.settings": ("AttackConfig",),
     "advsearch.questions.sweep.settings": ("SweepConfig",),
-    "advsearch.report.shown": ("Claim", "Column", "InNotebook", "ResultPart", "ShownResult"),
+    "advsearch.report.shown": ("Claim", "Column", "InNotebook", "Picture", "ResultPart", "ShownResult"),
     "advsearch.runs.directory": ("RunDirectory", "find_run"),
     "advsearch.runs.exporters": ("Exported", "Exporter"),
     "advsearch.runs.results": ("Fields", "Interval", "RunResult"),
@@ -96,9 +104,14 @@ _MODULES = {
     "color": "advsearch.scene.color",
     "figures": "advsearch.report.figures",
     "geometry": "advsearch.scene.geometry",
+    "problems": "advsearch.api.problems",
+    "results": "advsearch.runs.results",
     "seeds": "advsearch.seeds",
+    "settings": "advsearch.settings",
     "statistics": "advsearch.statistics",
+    "stored_files": "advsearch.trust.stored_files",
     "wording": "advsearch.report.wording",
+    "writing": "advsearch.trust.writing",
 }
 """Modules of functions that belong to the interface as a whole."""
 

@@ -17,14 +17,14 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advsearch.questions.test.settings import SuiteConfig, suite_of
+from advsearch.registry import get_experiment
 from advsearch.settings import PythonOnly
 from advsearch.trust.code import allow_named
 
 if TYPE_CHECKING:
     from advsearch.engine.loading import Scene
     from advsearch.engine.naming import AnyModel
-    from advsearch.questions.test.result import ClaimResult, SuiteResult
+    from advsearch.runs.results import RunResult
 
 __all__ = ["assert_no_worse", "assert_not_broken", "assert_right", "assert_suite"]
 
@@ -39,7 +39,7 @@ def assert_right(
     seed: int = 0,
     run: str | Path | None = None,
     **settings: Any,
-) -> SuiteResult:
+) -> RunResult:
     """Assert that a model is right in at least a share of the pictures that the controls span.
 
     Pictures are drawn until that is shown or refuted at the stated confidence.
@@ -70,7 +70,7 @@ def assert_not_broken(
     seed: int = 0,
     run: str | Path | None = None,
     **settings: Any,
-) -> SuiteResult:
+) -> RunResult:
     """Assert that a search finds no configuration that a model gets wrong. That it finds none is no proof.
 
     Args:
@@ -96,7 +96,7 @@ def assert_no_worse(
     seed: int = 0,
     run: str | Path | None = None,
     **settings: Any,
-) -> SuiteResult:
+) -> RunResult:
     """Assert that a model is right at most so many percentage points less often than another, on the same pictures.
 
     Args:
@@ -113,7 +113,7 @@ def assert_no_worse(
     return _asserted(claim, object, {"model": model, "than": than}, settings, confidence, seed, run)
 
 
-def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
+def assert_suite(suite: str | Path, **settings: Any) -> RunResult:
     """Assert that all claims of a suite are held, or are what was expected when it was last updated.
 
     Args:
@@ -127,11 +127,11 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
     __tracebackhide__ = True
     # late: torch takes long to import
     from advsearch.engine.naming import in_turn
-    from advsearch.questions.test.carry_out import test_from_config
 
+    experiment = get_experiment("test")
     allow_named(settings)
     with in_turn():
-        result = test_from_config(SuiteConfig(**{"suite": str(suite), **settings}))
+        result: Any = experiment.run(experiment.settings(**{"suite": str(suite), **settings}))
     if bad := [claim for claim in result.claims if not claim.accepted]:
         raise AssertionError("\n\n".join(_report(result, claim, claim.repeat) for claim in bad))
     return result
@@ -145,13 +145,13 @@ def _asserted(
     confidence: float,
     seed: int,
     run: str | Path | None,
-) -> SuiteResult:
+) -> RunResult:
     __tracebackhide__ = True
     # late: torch takes long to import
     from advsearch.engine import loading
     from advsearch.engine.naming import exists_here, in_turn, model_name
-    from advsearch.questions.test.carry_out import test_from_config
 
+    experiment = get_experiment("test")
     name = str(claim["claim"]).replace("_", "-")
     with ExitStack() as stack:
         stack.enter_context(in_turn())
@@ -172,11 +172,10 @@ def _asserted(
             given["controls"] = loading.settings_of(given["controls"])
         title = f"assert_{claim['claim']}"
         values = {"title": title, "settings": given, "seed": seed, "confidence": confidence, "claims": {name: said}}
-        suite = suite_of(values, title)
         only_here = [PythonOnly("call", f"of {title}")]
         only_here += [PythonOnly("model", model_name(model)) for model in models.values() if exists_here(model)]
-        config = SuiteConfig(suite=title, run=None if run is None else str(run)).with_only_here(only_here)
-        result = test_from_config(config, suite=suite)
+        config = experiment.settings(suite=title, run=None if run is None else str(run)).with_only_here(only_here)
+        result: Any = experiment.run(config, suite=values)
     (claimed,) = result.claims
     if claimed.answer != "held":
         test = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]
@@ -185,7 +184,7 @@ def _asserted(
     return result
 
 
-def _report(result: SuiteResult, claim: ClaimResult, again: str) -> str:
+def _report(result: RunResult, claim: Any, again: str) -> str:
     run = Path(result.run or "")
     lines = [f"{claim.name}: {claim.answer}: {claim.reason}", f"  claimed: {claim.statement}"]
     lines += [f"  picture: {(run / claim.picture).resolve()}"] if claim.picture else []

@@ -91,7 +91,7 @@ RULES = {
     "maite": Rule({"scene", "models", "tasks", "engine"}, {"torch"}),
     "experiment": Rule({"runs", "report", "viewer", "api", "settings"}, {"pydantic"}, HEAVY),
     "questions": Rule(None, None, frozenset(RENDERER)),
-    "testing": Rule({"questions", "engine", "config", "settings"}, set()),
+    "testing": Rule({"engine", "runs", "settings"}, set()),
     "api": Rule(None),
     "extend": Rule(None, set()),
     "cli": Rule(None),

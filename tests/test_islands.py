@@ -88,12 +88,6 @@ NOT_YET: frozenset[str] = frozenset(
         "advsearch/questions/stability/result.py",
         "advsearch/questions/stability/scene.py",
         "advsearch/questions/stability/scenes.py",
-        "advsearch/questions/test/__init__.py",
-        "advsearch/questions/test/carry_out.py",
-        "advsearch/questions/test/claims.py",
-        "advsearch/questions/test/counterexamples.py",
-        "advsearch/questions/test/result.py",
-        "advsearch/questions/test/settings.py",
         "advsearch/scene/importing/blender.py",
         "advsearch/scene/importing/usd.py",
         "advsearch/tasks/answers.py",
@@ -115,7 +109,6 @@ CORE_NOT_YET: frozenset[str] = frozenset(
         "advsearch/scene/cycles.py",
         "advsearch/scene/importing/usd_layers.py",
         "advsearch/scene/importing/usd_stage.py",
-        "advsearch/testing.py",
     }
 )
 """Files of the core that still import an island. The list only gets shorter."""

@@ -7,7 +7,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -201,6 +201,25 @@ class RunDirectory:
         self.store.append(rows, told)
         if self._tracker is not None:
             self._tracker.rows(rows)
+
+    @staticmethod
+    def digest_files(values: Mapping[str, Any]) -> dict[str, str]:
+        """Return the SHA-256 of each file that settings name, and of each that was read for it, in hexadecimal."""
+        return summary.file_digests(values)
+
+    @staticmethod
+    def find_changed_file(before: Sequence[Mapping[str, object]], values: Mapping[str, Any]) -> str | None:
+        """Return the name of a file that settings name and whose digest is in none of those of before, or None."""
+        return summary.changed_file(before, values)
+
+    @staticmethod
+    def locate_part(run: Path, name: str) -> Path:
+        """Return the folder of a part of a run, whether it exists or not."""
+        return run / PARTS / name
+
+    def write_file(self, name: str, data: bytes) -> Path:
+        """Write a file of the run, whose name is relative to the run directory, and return its path."""
+        return write_bytes(self.path / name, data)
 
     def save_image(self, name: str, image: Any, folder: str = IMAGES) -> Path:
         """Write ``<folder>/<name>.png`` of (H, W, 3) or (H, W), display-referred sRGB in [0, 1], numpy or torch; return

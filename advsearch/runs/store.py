@@ -102,6 +102,11 @@ class Store:
             check_schema(self._db, path, SCHEMA)
         self._closed: Callable[[], None] | None = None if read_only else note_open(path)
 
+    @staticmethod
+    def is_in(run: Path) -> bool:
+        """Return whether a run directory has results."""
+        return (run / NAME).is_file()
+
     @classmethod
     def open_to_read(cls, run: Path) -> Store:
         """Open the results in a run directory for reading, beside a process that may write."""

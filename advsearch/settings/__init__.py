@@ -5,7 +5,17 @@
 
 from __future__ import annotations
 
-from advsearch.settings.configuration import FILES, Clash, Config, PythonOnly, Setting, setting, setting_as_in, settings
+from advsearch.settings.configuration import (
+    FILES,
+    PLACE,
+    Clash,
+    Config,
+    PythonOnly,
+    Setting,
+    setting,
+    setting_as_in,
+    settings,
+)
 from advsearch.settings.values import (
     HEADER,
     all_finite,
@@ -22,10 +32,12 @@ from advsearch.settings.values import (
     split_names,
     texts,
 )
+from advsearch.trust import powers
 
 __all__ = [
     "FILES",
     "HEADER",
+    "PLACE",
     "Clash",
     "Config",
     "PythonOnly",
@@ -38,6 +50,7 @@ __all__ = [
     "names_together",
     "number_or_text",
     "parse_assignment",
+    "powers",
     "read_controls",
     "read_yaml",
     "setting",

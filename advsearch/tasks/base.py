@@ -22,7 +22,7 @@ from advsearch.copies import hand_copies
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
-from advsearch.options import FROM_RUN, NOT_A_NUMBER
+from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW
 
 Output = Any  # what a model returns for N pictures: a tensor (N, ...), or a list with one thing for each picture
 Truth = Any  # what is true of a scene, as its task needs it: the right classes, a number, boxes
@@ -42,6 +42,11 @@ class Prediction:
     label: str
     index: int | None = None
     probability: float | None = None
+
+    @property
+    def is_out_of_view(self) -> bool:
+        """Whether nothing of what is judged can be seen in the picture."""
+        return self.label == OUT_OF_VIEW
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,8 @@ class SweepConfig(SceneConfig):
     """Everything that decides what `sweep` does: the average case over a grid, over random draws, or both."""
 
     command: ClassVar[str] = "sweep"
+    blind_changes: ClassVar[Mapping[str, str]] = BLIND
+    harmless_changes: ClassVar[Mapping[str, str]] = HARMLESS
     free: ClassVar[tuple[str, ...]] = (*SceneConfig.free, "surface", "workers", "cluster", "log")
     several: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
     # fmt: off

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from advsearch.errors import InputError
-from advsearch.experiment import PositionalArgument, RunContext, experiment
+from advsearch.extend import InputError, PositionalArgument, RunContext, experiment, writing
 from advsearch.questions.test import result as results
 from advsearch.questions.test.recorded import noted_settings
 from advsearch.questions.test.result import SuiteResult
-from advsearch.questions.test.settings import Suite, SuiteConfig
+from advsearch.questions.test.settings import SuiteConfig, suite_of
 
 FORMATS = {"junit": results.junit, "sarif": results.sarif, "markdown": results.markdown}
 """Settings that name a file for other programs, and what writes its text from the result."""
@@ -29,21 +30,20 @@ FORMATS = {"junit": results.junit, "sarif": results.sarif, "markdown": results.m
     claims=results.claims,
     noted_settings=noted_settings,
 )
-def test(context: RunContext[SuiteConfig], suite: Suite | None = None) -> SuiteResult:
+def test(context: RunContext[SuiteConfig], suite: Mapping[str, Any] | None = None) -> SuiteResult:
     """Try the claims of a suite, counterexamples first, and write the files for other programs (docs/testing.md).
 
     Args:
         suite: a YAML file.
     """
-    from advsearch.questions.test.carry_out import test_from_config  # imports torch
-    from advsearch.trust.writing import write_text
+    from advsearch.questions.test.carry_out import try_suite  # imports torch
 
     config = context.config
     files = {name: Path(file) for name in FORMATS if (file := getattr(config, name))}
     for name, path in files.items():
         if path.is_dir() or not path.absolute().parent.is_dir():
             raise InputError(f"{name}: expected a file in a folder that is there, got {path}; make the folder first")
-    result = test_from_config(config, progress=context.progress, resumed=context.resumed, suite=suite)
+    result = try_suite(context, None if suite is None else suite_of(suite, config.suite))
     for name, path in files.items():
-        write_text(path, FORMATS[name](result), durable=False)
+        writing.write_text(path, FORMATS[name](result), durable=False)
     return result

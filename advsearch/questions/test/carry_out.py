@@ -9,16 +9,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import advsearch.questions.test.counterexamples as beside
-import advsearch.questions.test.result as room
-import advsearch.questions.test.settings as suites
-from advsearch.config import SceneConfig
-from advsearch.engine.record import Results
-from advsearch.errors import InputError, UnknownNameError
-from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress
-from advsearch.questions.attack.carry_out import check_from_config
-from advsearch.questions.attack.settings import AttackConfig
+from advsearch.extend import (
+    AttackConfig,
+    InputError,
+    RunContext,
+    SceneConfig,
+    Store,
+    UnknownNameError,
+    problems,
+    results,
+)
+from advsearch.questions.test import counterexamples, settings
 from advsearch.questions.test.claims import Trial, check_pictures
 from advsearch.questions.test.counterexamples import Counterexample
 from advsearch.questions.test.recorded import SETTINGS_NOTE, SUITE_NOTE
@@ -28,16 +29,15 @@ from advsearch.questions.test.result import (
     NOT_YET,
     STOPPED,
     TIME_OVER,
+    UNDECIDED,
     Cause,
     ClaimResult,
     SuiteResult,
+    cannot_be_judged,
+    statement,
+    verdict,
 )
 from advsearch.questions.test.settings import COUNTEREXAMPLES, NotBrokenClaim, NoWorseClaim, Suite, SuiteConfig
-from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME
-from advsearch.runs.store import NAME as STORE
-from advsearch.runs.store import Store
-from advsearch.viewer.pages import keep_result
 
 
 @dataclass(frozen=True)
@@ -51,24 +51,22 @@ class PlannedClaim:
     refusal: str = ""  # why a counterexample cannot be tried on the model; its own model's settings stand in `config`
 
 
-def test_from_config(
-    config: SuiteConfig, *, progress: Progress | None = None, resumed: Path | None = None, suite: Suite | None = None
-) -> SuiteResult:
-    """Try the claims of the suite that a configuration names, or of another one; what is decided is not tried again. An
-    InputError where the suite names something that is not there, contradicts itself, or could not be judged; nothing is
-    rendered then."""
-    begun, progress = time.perf_counter(), progress or NullProgress()
-    progress.stage("reading the suite")
-    noted = None
-    if resumed is not None and (resumed / STORE).is_file():  # a run that was stopped at once has noted no suite
-        with Store(resumed / STORE, read_only=True) as store:
-            noted = store.noted(SUITE_NOTE)
-    described = suites.suite_of(noted, f"{resumed}: the suite that it began with") if noted is not None else suite
-    if described is None:
-        described = suites.read_suite(config.suite)
-        seed = secrets.randbelow(2**31) if config.fresh else described.seed if config.seed is None else config.seed
-        described = described.model_copy(update={"seed": seed})
-    added = None if config.add is None else beside.add(config.suite, config.add)
+def try_suite(context: RunContext[SuiteConfig], suite: Suite | None = None) -> SuiteResult:
+    """Try the claims of a suite; what is decided is not tried again.
+
+    Args:
+        context: of the experiment; its settings name the suite.
+        suite: in place of the one that the settings name.
+
+    Raises:
+        InputError: the suite names something that is not there, contradicts itself, or could not be judged; nothing is
+            rendered then.
+    """
+    begun = time.perf_counter()
+    config = context.config
+    context.progress.stage("reading the suite")
+    described = _read_noted_suite(context.resumed) or suite or _read_suite(config)
+    added = None if config.add is None else counterexamples.add(config.suite, config.add)
     try:
         planned = _planned(described, config, added)
         for claim in planned if described is not suite else ():
@@ -76,26 +74,47 @@ def test_from_config(
         remarks = _check(planned, described)
     except InputError as error:
         if added is not None:
-            beside.remove(added)
+            counterexamples.remove(added)
         raise InputError(f"{config.suite}: {error}") from None
-    with RunDirectory.of(config, resumed) as run:
-        run.store.set_note(SUITE_NOTE, json.dumps(described.model_dump(mode="json")))
-        judged_with = {claim.name: claim.config.deciding() for claim in planned if claim.example is not None}
-        run.store.set_note(SETTINGS_NOTE, json.dumps(judged_with))
-        for claim in planned:
-            run.note_sitting(claim.config)
-            tested = None if claim.example is not None else described.claims[claim.name]
-            if isinstance(tested, NoWorseClaim):
-                run.note_sitting(claim.config.model_copy(update={"model": tested.than}))
-        for remark in remarks:
-            progress.message(remark)
-        trial = Trial(run, config, described, begun, progress, remarks)
-        suite_run = _SuiteRun(trial, planned, beside.read_expected(config.suite))
-        ending = suite_run.carry_out()
-        if added is not None and suite_run.results[0].answer != FAILED:
-            beside.remove(added)
-            raise InputError(f"add: the adversarial scene of {config.add} is not kept: {suite_run.results[0].reason}")
-        return keep_result(run, suite_run.result(ending, added))
+    _note_settings(context, described, planned)
+    for remark in remarks:
+        context.progress.message(remark)
+    trial = Trial(context, described, begun, remarks)
+    suite_run = _SuiteRun(trial, planned, counterexamples.read_expected(config.suite))
+    context.ending = suite_run.carry_out()
+    if added is not None and suite_run.results[0].answer != FAILED:
+        counterexamples.remove(added)
+        raise InputError(f"add: the adversarial scene of {config.add} is not kept: {suite_run.results[0].reason}")
+    return suite_run.result(context.ending, added)
+
+
+def _read_noted_suite(resumed: Path | None) -> Suite | None:
+    """Return the suite that a run began with; None for a new run, and for one that was stopped before it noted any."""
+    if resumed is None or not Store.is_in(resumed):
+        return None
+    with Store.open_to_read(resumed) as store:
+        noted = store.noted(SUITE_NOTE)
+    return None if noted is None else settings.suite_of(noted, f"{resumed}: the suite that it began with")
+
+
+def _read_suite(config: SuiteConfig) -> Suite:
+    """Return the suite that settings name, with the seed that they state, or a fresh one."""
+    described = settings.read_suite(config.suite)
+    seed = described.seed if config.seed is None else config.seed
+    return described.model_copy(update={"seed": secrets.randbelow(2**31) if config.fresh else seed})
+
+
+def _note_settings(context: RunContext[SuiteConfig], suite: Suite, planned: Sequence[PlannedClaim]) -> None:
+    """Make the run, and note what its claims are judged with, so that it goes on as it began."""
+    run = context.run
+    run.store.set_note(SUITE_NOTE, json.dumps(suite.model_dump(mode="json")))
+    judged_with = {claim.name: claim.config.deciding() for claim in planned if claim.example is not None}
+    run.store.set_note(SETTINGS_NOTE, json.dumps(judged_with))
+    for claim in planned:
+        run.note_sitting(claim.config)
+        tested = None if claim.example is not None else suite.claims[claim.name]
+        if isinstance(tested, NoWorseClaim):
+            run.note_sitting(claim.config.model_copy(update={"model": tested.than}))
 
 
 @dataclass
@@ -108,26 +127,26 @@ class _SuiteRun:
     results: list[ClaimResult] = field(default_factory=list)
 
     def carry_out(self) -> str:
-        trial, stored = self.trial, Results(self.trial.run)
-        try:
-            with interruptible():
-                for number, claim in enumerate(self.planned, start=1):
-                    self._add(claim, self._tried(claim, stored))
-                    trial.progress.message(f"{claim.name}: {self.results[-1].answer}: {self.results[-1].reason}")
-                    if number < len(self.planned):
-                        trial.run.write_summary(self.result(INTERRUPTED, None))  # what a kill leaves
-        except KeyboardInterrupt:
+        """Try every claim, and return how that ended."""
+        trial = self.trial
+        with trial.context.until_interrupted():
+            for number, claim in enumerate(self.planned, start=1):
+                self._add(claim, self._tried(claim))
+                trial.progress.message(f"{claim.name}: {self.results[-1].answer}: {self.results[-1].reason}")
+                if number < len(self.planned):
+                    trial.run.write_summary(self.result(results.INTERRUPTED, None))  # what a kill leaves
+        if trial.context.ending == results.INTERRUPTED:
             for claim in self.planned[len(self.results) :]:
                 self._add(claim, self._not_tried(claim, STOPPED, Cause.INTERRUPTED))
-            return INTERRUPTED
+            return results.INTERRUPTED
         causes = {tried.cause for tried in self.results}
         if Cause.COUNTEREXAMPLE_FAILED in causes:
             trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
-        return OUT_OF_TIME if Cause.OUT_OF_TIME in causes else "done"
+        return results.OUT_OF_TIME if Cause.OUT_OF_TIME in causes else "done"
 
-    def _tried(self, claim: PlannedClaim, results: Results) -> ClaimResult:
+    def _tried(self, claim: PlannedClaim) -> ClaimResult:
         key, trial = f"claim {claim.name}", self.trial
-        if (stored := results.stored(key)) is not None:
+        if (stored := trial.run.store.noted(key)) is not None:
             return ClaimResult.of(stored)
         failed = any(known.kind == "counterexample" and not known.accepted for known in self.results)
         if failed and claim.example is None and not trial.config.all:
@@ -146,13 +165,13 @@ class _SuiteRun:
             raise KeyboardInterrupt
         tried = tried.model_copy(update={"seconds": time.perf_counter() - begun})
         if tried.cause is not Cause.OUT_OF_TIME:
-            results.put(key, tried.to_dict())
+            trial.run.store.set_note(key, json.dumps(tried.to_dict()))
         return tried
 
     def _not_tried(self, claim: PlannedClaim, reason: str, cause: Cause | None = None) -> ClaimResult:
-        text = room.statement(self.trial.suite.claims[claim.name], claim.config) if claim.example is None else ""
+        text = statement(self.trial.suite.claims[claim.name], claim.config) if claim.example is None else ""
         return ClaimResult(
-            name=claim.name, kind=claim.kind, statement=text, answer=room.UNDECIDED, reason=reason, cause=cause
+            name=claim.name, kind=claim.kind, statement=text, answer=UNDECIDED, reason=reason, cause=cause
         )
 
     def _add(self, claim: PlannedClaim, tried: ClaimResult) -> None:
@@ -170,18 +189,18 @@ class _SuiteRun:
         config, suite = self.trial.config, self.trial.suite
         configs, changes = [claim.config for claim in self.planned], list[str]()
         ahead = self.planned[len(self.results) :]
-        results = [*self.results, *(self._not_tried(claim, NOT_YET, Cause.NOT_REACHED) for claim in ahead)]
+        claims = [*self.results, *(self._not_tried(claim, NOT_YET, Cause.NOT_REACHED) for claim in ahead)]
         if config.update and ending == "done":
-            now = {tried.name: tried.answer for tried in results if tried.cause is not Cause.COUNTEREXAMPLE_FAILED}
-            changes = beside.write_expected(config.suite, now)
-            results = [tried.model_copy(update={"expected": now.get(tried.name, tried.expected)}) for tried in results]
+            now = {tried.name: tried.answer for tried in claims if tried.cause is not Cause.COUNTEREXAMPLE_FAILED}
+            changes = counterexamples.write_expected(config.suite, now)
+            claims = [tried.model_copy(update={"expected": now.get(tried.name, tried.expected)}) for tried in claims]
         return SuiteResult(
             run=str(self.trial.run.path), suite=config.suite, title=suite.title,
             object=",".join(dict.fromkeys(config.object for config in configs)),
             model=",".join(dict.fromkeys(config.model for config in configs)),
             environment=",".join(dict.fromkeys(config.lit_by for config in configs)),
             controls=list(dict.fromkeys(name for config in configs for name in config.controls)),
-            answer=room.verdict(results), confidence=suite.confidence, claims=results, ending=ending,
+            answer=verdict(claims), confidence=suite.confidence, claims=claims, ending=ending,
             added=None if added is None else str(added.path), changes=changes,
             warnings=list(dict.fromkeys(self.trial.warnings)), seconds={"total": self.trial.passed}, seed=suite.seed,
             command_line=self._repeat(),
@@ -190,7 +209,7 @@ class _SuiteRun:
 
 def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) -> list[PlannedClaim]:
     changes = {"model": config.model, "threads": config.threads, "deterministic": config.deterministic or None}
-    examples = beside.counterexamples(config.suite) if added is None else [added]
+    examples = counterexamples.counterexamples(config.suite) if added is None else [added]
     planned = [_planned_example(example, suite, changes) for example in examples]
     if twice := [example.name for example in planned if example.name in suite.claims]:
         raise InputError(f"claims.{twice[0]}: a counterexample is called so, too; call the claim something else")
@@ -211,8 +230,8 @@ def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) ->
     ]
     if not chosen:
         raise InputError(
-            f"only: expected {COUNTEREXAMPLES} in {beside.folder_of(config.suite)}, got none, so that nothing would be "
-            "tested; keep the adversarial scene of a run with `add`, or leave `only` out"
+            f"only: expected {COUNTEREXAMPLES} in {counterexamples.folder_of(config.suite)}, got none, so that nothing "
+            "would be tested; keep the adversarial scene of a run with `add`, or leave `only` out"
         )
     return chosen
 
@@ -223,7 +242,7 @@ def _planned_example(example: Counterexample, suite: Suite, changes: Mapping[str
         config = example.config_for(suite, changes)
     except InputError as error:
         config = example.config
-        refusal = room.cannot_be_judged(str(error))
+        refusal = cannot_be_judged(str(error))
     return PlannedClaim(example.name, "counterexample", config, example, refusal)
 
 
@@ -250,7 +269,7 @@ def _check(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
         for wanted in (config, *than):
             if wanted not in known:
                 try:
-                    check_from_config(wanted)
+                    problems.check_from_config(wanted)
                 except InputError as error:
                     raise InputError(f"claims.{each.name}: {error}") from None
                 known.append(wanted)

@@ -13,24 +13,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import advsearch.questions.test.result as words
-import advsearch.questions.test.settings as suites
-from advsearch import seeds
-from advsearch.attacks import Evaluation
-from advsearch.attacks.evaluation import Query
-from advsearch.config import SceneConfig
-from advsearch.engine.image_changes import AWAY, as_claimed, changed
-from advsearch.engine.journal import Journal, Shared, worker_call
-from advsearch.engine.problem import Problem
-from advsearch.engine.verifier import ladder_of
-from advsearch.errors import InputError
-from advsearch.files import JsonObject, JsonValue
-from advsearch.options import OUT_OF_VIEW, count_outcomes
-from advsearch.progress import Progress
-from advsearch.questions.attack.carry_out import executor_for, parts_of, problem_on
-from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.studies import carry_out_part
-from advsearch.questions.attack.summary import AttackSummary
+from advsearch.extend import (
+    AttackConfig,
+    Evaluation,
+    InputError,
+    Judgement,
+    Problem,
+    Progress,
+    RunContext,
+    RunDirectory,
+    SceneConfig,
+    problems,
+    seeds,
+    settings,
+    statistics,
+    wording,
+)
+from advsearch.questions.test import result as words
+from advsearch.questions.test import settings as suites
 from advsearch.questions.test.counterexamples import (
     TRIALS,
     Counterexample,
@@ -41,15 +41,11 @@ from advsearch.questions.test.counterexamples import (
 )
 from advsearch.questions.test.result import FAILED, HELD, TIME_OVER, UNDECIDED, Cause, ClaimResult
 from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim, ShareClaim
-from advsearch.report.wording import number_text, outcomes_text
-from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
-from advsearch.settings import split_names
-from advsearch.statistics.intervals import clopper_pearson
-from advsearch.statistics.sequential import ConfidenceSequence, draws_needed
-from advsearch.tasks import Judgement
 
 MANY = 4  # values of a configuration that are said in words, at most
 MOST_KEPT = 64  # of a configuration with more numbers, a picture's row does not hold the values
+ChangePicture = Callable[["problems.Query", Tensor], Tensor]
+"""Goes from a query and its picture to the picture that the other side is shown."""
 AHEAD = 2  # pictures that are asked for at once, for each worker
 ATTACK_WORKER = "advsearch.questions.attack.carry_out:attack_worker"
 CLAIM_WORKER = "advsearch.questions.test.claims:claim_worker"
@@ -59,12 +55,22 @@ CLAIM_WORKER = "advsearch.questions.test.claims:claim_worker"
 class Trial:
     """What claims are tried with, since `begun` by the clock; `warnings` gets what a reader has to know."""
 
-    run: RunDirectory
-    config: suites.SuiteConfig
+    context: RunContext[suites.SuiteConfig]
     suite: suites.Suite
     begun: float
-    progress: Progress
     warnings: list[str]
+
+    @property
+    def run(self) -> RunDirectory:
+        return self.context.run
+
+    @property
+    def config(self) -> suites.SuiteConfig:
+        return self.context.config
+
+    @property
+    def progress(self) -> Progress:
+        return self.context.progress
 
     @property
     def passed(self) -> float:
@@ -86,16 +92,18 @@ class Trial:
         shared = {"workers": self.config.workers, "cluster": self.config.cluster}
         limited = {**shared, "seconds": seconds if math.isfinite(seconds) else None}
         own = config.model_copy(update=limited).with_only_here(config.only_here)
-        summary = carry_out_part(self.run.path / PARTS / asked.name, own, self.progress)
-        assert isinstance(summary, AttackSummary)
+        summary = self.context.run_part(asked.name, own)
+        assert isinstance(summary, problems.AttackSummary)
         self.warnings += summary.warnings
         planned = own.model_copy(update={"steps": own.steps or summary.steps})
         verdict, reason, cause = words.search_verdict(summary, planned)
         shown = "clean" if summary.ending == "already wrong" else "adversarial"
-        file = f"{PARTS}/{asked.name}/{IMAGES}/{shown}.png"
+        part = self.run.locate_part(self.run.path, asked.name)
+        picture = part / "images" / f"{shown}.png"
         outcome: dict[str, Any] = {"answer": verdict, "reason": reason, "cause": cause, "part": asked.name}
         outcome["pictures"] = sum(count for name, count in summary.renders.items() if name != "products")
-        outcome["picture"] = file if verdict == FAILED and (self.run.path / file).is_file() else None
+        is_kept = verdict == FAILED and picture.is_file()
+        outcome["picture"] = picture.relative_to(self.run.path).as_posix() if is_kept else None
         return asked.model_copy(update=outcome)
 
     def _by_pictures(self, asked: ClaimResult, claim: ShareClaim | NoWorseClaim, config: SceneConfig) -> ClaimResult:
@@ -104,7 +112,7 @@ class Trial:
         problem, kind, spp = self._problem(config), f"claim {asked.name}", spp_of(config)
         shared = AttackConfig.of(config, workers=self.config.workers, cluster=self.config.cluster)
         worker, other, several = ATTACK_WORKER, problem, isinstance(claim, NoWorseClaim)
-        shown: Callable[[Query, Tensor], Tensor] | None = None  # to the other side; without, a picture of its own
+        shown: ChangePicture | None = None  # to the other side; without, a picture of its own
         if isinstance(claim, NoWorseClaim):
             worker, other = CLAIM_WORKER, self._problem(config.model_copy(update={"model": claim.than}))
             shared = shared.model_copy(update={"model": f"{config.model},{claim.than}"})
@@ -112,16 +120,17 @@ class Trial:
                 shown = _same_picture
         elif isinstance(claim, ChangeClaim):  # judged by what was true before it was changed
             shown = self._changed(claim, config, problem)
-        sequence, least = ConfidenceSequence(self.suite.confidence, sides=1), least_mean(claim)
+        sequence, least = statistics.sequential.ConfidenceSequence(self.suite.confidence, sides=1), least_mean(claim)
         values, hidden, verdict = list[float](), 0, UNDECIDED
-        worst: tuple[float, Query, str] | None = None
-        wrong_payloads: list[JsonValue] = []
+        worst: tuple[float, problems.Query, str] | None = None
+        wrong_payloads: list[Any] = []
         self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
-        with executor_for(shared, worker, self.progress) as executor:
-            journal = Journal(self.run, Shared(problem, executor, "0" if several else ""))
+        with problems.executor_for(shared, worker, self.progress) as executor:
+            journal = problems.Journal(self.run, problems.Shared(problem, executor, "0" if several else ""))
             beside = None
             if not isinstance(claim, RightClaim):
-                beside = Journal(self.run, Shared(other, executor, "1") if several else Shared(other))
+                shared_by_workers = problems.Shared(other, executor, "1") if several else problems.Shared(other)
+                beside = problems.Journal(self.run, shared_by_workers)
             for query, own, its in self._pairs(journal, drawn(problem, kind, claim.pictures, spp), beside, shown):
                 value, badness, text = valued(claim, own, its)
                 if value is None:
@@ -147,40 +156,40 @@ class Trial:
             what = "right" if isinstance(claim, RightClaim) else "as claimed"
             outcomes = ""
             if isinstance(claim, RightClaim):
-                outcomes = outcomes_text(count_outcomes(wrong_payloads), problem.task.name)
+                outcomes = wording.outcomes_text(problems.count_outcomes(wrong_payloads), problem.task.name)
             reason = words.share_reason(what, verdict, values.count(1.0), len(values), interval, example, outcomes)
         reason += f"; the object is not to be seen in {hidden} more, which are not counted" if hidden else ""
         cause = Cause.OUT_OF_TIME if verdict == UNDECIDED and self.late else None
         reason += f"; {TIME_OVER}" if cause is Cause.OUT_OF_TIME else ""
-        outcome = {"answer": verdict, "reason": reason, "cause": cause, "pictures": len(values), "spp": spp}
-        outcome["interval"] = interval
+        outcome: dict[str, Any] = {"answer": verdict, "reason": reason, "cause": cause, "interval": interval}
+        outcome |= {"pictures": len(values), "spp": spp}
         outcome["rate"] = mean if values else None
         outcome["picture"] = self._picture(asked.name, problem, worst[1]) if worst else None
         return asked.model_copy(update=outcome)
 
-    def _changed(self, claim: ChangeClaim, config: SceneConfig, problem: Problem) -> Callable[[Query, Tensor], Tensor]:
+    def _changed(self, claim: ChangeClaim, config: SceneConfig, problem: Problem) -> ChangePicture:
         """Return what shows a model the changed picture of a query."""
-        if claim.when != AWAY:
-            return lambda query, picture: changed(picture, claim.when, problem.model.cameras)
+        if claim.when != problems.AWAY:
+            return lambda query, picture: problems.changed(picture, claim.when, problem.model.cameras)
         other = self._problem(config)
         other.renderer.scene.assembly.away = True
         return lambda query, picture: other.picture(query.u, query.seed, query.spp)
 
     def _pairs(
-        self, journal: Journal, queries: Iterator[Query], beside: Journal | None = None,
-        shown: Callable[[Query, Tensor], Tensor] | None = None,
-    ) -> Iterator[tuple[Query, Evaluation, Evaluation | None]]:  # fmt: skip
+        self, journal: problems.Journal, queries: Iterator[problems.Query], beside: problems.Journal | None = None,
+        shown: ChangePicture | None = None,
+    ) -> Iterator[tuple[problems.Query, Evaluation, Evaluation | None]]:  # fmt: skip
         """Yield queries, as many at once as there are workers for, until the time is over; with what is said of each,
         and what the other side says of what is `shown` to it of this picture; without, of a picture of its own."""
         pictures: dict[int, Tensor | None] = {}
 
-        def here(queries: Sequence[Query]) -> Iterator[Evaluation]:
+        def here(queries: Sequence[problems.Query]) -> Iterator[Evaluation]:
             evaluations = journal.traced([replace(query, keep=shown is not None) for query in queries])
             for query, evaluation in zip(queries, evaluations, strict=True):
                 pictures[query.number] = evaluation.picture
                 yield evaluation
 
-        def there(queries: Sequence[Query]) -> Iterable[Evaluation]:
+        def there(queries: Sequence[problems.Query]) -> Iterable[Evaluation]:
             assert beside is not None
             if shown is None:
                 yield from beside.traced(queries)
@@ -210,14 +219,14 @@ class Trial:
         """Try a counterexample: the model should be right on it. Trials by which it is added are no trials of it."""
         asked = asked.model_copy(update={"statement": f"{config.model} is right where it said {example.said}"})
         try:
-            parts = parts_of(config)
-            problem = problem_on(parts, differentiated=False)
+            parts = problems.parts_of(config)
+            problem = problems.problem_on(parts, differentiated=False)
         except InputError as error:
             return asked.model_copy(update={"reason": words.cannot_be_judged(str(error))})
         if file := example.changed_file(config):
             reason = f"the file {file} is another one now; put it back, or remove the counterexample"
             return asked.model_copy(update={"reason": reason})
-        if scene_digest(parts.scene) != example.scene:
+        if scene_digest(parts.scene.description) != example.scene:
             reason = "its scene is another one now; remove it, or add the adversarial scene of a new run"
             return asked.model_copy(update={"reason": reason})
         start = problem.domain.start
@@ -225,9 +234,9 @@ class Trial:
         over = is_over(config)
         count = TRIALS[over]
         kind = f"{'added ' if self.config.add is not None else ''}counterexample {example.name}"
-        journal = Journal(self.run, Shared(problem))
+        journal = problems.Journal(self.run, problems.Shared(problem))
         outcomes = list[bool | None]()
-        wrong_payloads: list[JsonValue] = []
+        wrong_payloads: list[Any] = []
         label = ""
         picture: str | None = None
         self.progress.stage(example.name, 4 * count if over else count, at_most=True)
@@ -242,9 +251,9 @@ class Trial:
                 break
         right, wrong = outcomes.count(True), outcomes.count(False)
         verdict = decide_trials(right, wrong, over=over)
-        interval = clopper_pearson(right, right + wrong) if right + wrong else None
+        interval = statistics.intervals.clopper_pearson(right, right + wrong) if right + wrong else None
         counts = (right, wrong, outcomes.count(None))
-        became = outcomes_text(count_outcomes(wrong_payloads), problem.task.name)
+        became = wording.outcomes_text(problems.count_outcomes(wrong_payloads), problem.task.name)
         reason = words.tried_reason(verdict, counts, label, interval, over=over, outcomes=became)
         outcome: dict[str, Any] = {"pictures": len(outcomes), "spp": example.spp}
         if self.late and right + wrong < count and not (right and wrong and not over):
@@ -255,13 +264,13 @@ class Trial:
         return asked.model_copy(update={**outcome, "interval": interval})
 
     def _trials_of(
-        self, journal: Journal, kind: str, u: Tensor, spp: int, *, over: bool
-    ) -> Iterator[tuple[Query, Judgement, Judgement | None]]:
+        self, journal: problems.Journal, kind: str, u: Tensor, spp: int, *, over: bool
+    ) -> Iterator[tuple[problems.Query, Judgement, Judgement | None]]:
         """Yield trials of one configuration (d,), and of the clean scene in the same conditions where these vary."""
         problem = journal.problem
-        queries = list[Query]()
+        queries = list[problems.Query]()
         for number in range(2 * TRIALS[over]):
-            query = Query(u, seeds.stream(self.suite.seed, kind, number), kind, number, spp=spp)
+            query = problems.Query(u, seeds.stream(self.suite.seed, kind, number), kind, number, spp=spp)
             queries.append(query)
             if over:
                 queries.append(replace(query, u=problem.domain.start, kind=f"{kind}, clean"))
@@ -273,42 +282,43 @@ class Trial:
             yield query, trial.said, None if clean is None else clean[1].said
 
     def _problem(self, config: SceneConfig) -> Problem:
-        parts = parts_of(AttackConfig.of(config))
+        parts = problems.parts_of(AttackConfig.of(config))
         remarks = [*parts.loaded[1]]  # without those of the task, which stand in the reason
-        problem = problem_on(parts, differentiated=False)
+        problem = problems.problem_on(parts, differentiated=False)
         self.warnings += [*problem.space.notes(parts.scene.description), *remarks]
         return problem
 
-    def _picture(self, name: str, problem: Problem, query: Query) -> str:
-        self.run.save_image(name, problem.picture(query.u, query.seed, query.spp, drawn=query.drawn))
-        return f"{IMAGES}/{name}.png"
+    def _picture(self, name: str, problem: Problem, query: problems.Query) -> str:
+        picture = problem.picture(query.u, query.seed, query.spp, drawn=query.drawn)
+        return self.run.save_image(name, picture).relative_to(self.run.path).as_posix()
 
-    def _described(self, problem: Problem, query: Query) -> str:
+    def _described(self, problem: Problem, query: problems.Query) -> str:
         values = list(problem.describe(query.u, query.seed).items())
         shown = []
         for name, value in values[:MANY]:
             unit = "" if value["unit"] in ("1", "name") else f" {value['unit']}"
-            shown.append(f"{name} {number_text(value['value'])}{unit}")
+            shown.append(f"{name} {wording.number_text(value['value'])}{unit}")
         return ", ".join([*shown, *(["..."] if len(values) > MANY else [])])
 
 
-def claim_worker(settings: JsonObject) -> Callable[[Any], Any]:
-    models = split_names(str(settings["model"]))
+def claim_worker(values: dict[str, Any]) -> Callable[[Any], Any]:
+    models = settings.split_names(str(values["model"]))
 
-    def problem(name: str) -> Problem:
-        return problem_on(parts_of(AttackConfig(**{**settings, "model": models[int(name)]})), differentiated=False)
+    def load_problem(name: str) -> Problem:
+        config = AttackConfig(**{**values, "model": models[int(name)]})
+        return problems.problem_on(problems.parts_of(config), differentiated=False)
 
-    return worker_call(cache(problem))
+    return problems.worker_call(cache(load_problem))
 
 
-def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[Query]:
+def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[problems.Query]:
     """Draw configurations evenly from the whole space and budget, one after the other, each with a seed of its own."""
     for number in range(count):
         generator = torch.Generator().manual_seed(seeds.stream(problem.seed, f"{kind} draw", number))
         (u,) = problem.domain.sample(generator)
         seed = seeds.stream(problem.seed, kind, number)
         values = problem.describe(u, seed) if problem.domain.dim <= MOST_KEPT else {}
-        yield Query(u, seed, kind, number, spp=spp, values=values, sought=False)
+        yield problems.Query(u, seed, kind, number, spp=spp, values=values, sought=False)
 
 
 def least_mean(claim: ShareClaim | NoWorseClaim) -> float:
@@ -322,13 +332,15 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
     if not isinstance(claim, ShareClaim | NoWorseClaim):
         return ""
     least = least_mean(claim)
-    needed = max(draws_needed(mean, confidence=confidence) for mean in (least, 1.0 - least))
+    needed = max(statistics.sequential.draws_needed(mean, confidence=confidence) for mean in (least, 1.0 - least))
     if claim.pictures < needed:
         raise InputError(
             f"claims.{name}.pictures: expected at least {needed}, as fewer cannot both hold and fail this claim at a "
-            f"confidence of {number_text(confidence)} whatever the model predicts, got {claim.pictures}"
+            f"confidence of {wording.number_text(confidence)} whatever the model predicts, got {claim.pictures}"
         )
-    alike = draws_needed(least, confidence=confidence, value=0.5) if isinstance(claim, NoWorseClaim) else 0
+    if not isinstance(claim, NoWorseClaim):
+        return ""
+    alike = statistics.sequential.draws_needed(least, confidence=confidence, value=0.5)
     if claim.pictures >= alike:
         return ""
     return (
@@ -342,8 +354,8 @@ def valued(
     """Return what a picture says for a claim, from 0 to 1, or None where the object is not to be seen; how bad an
     example it is of what is against it, and which."""
     before = own.said.prediction
-    other_label = its.said.prediction.label if its is not None and isinstance(claim, NoWorseClaim) else None
-    if OUT_OF_VIEW in (before.label, other_label):  # pictures of two sizes need not show the same
+    hidden_from_other = isinstance(claim, NoWorseClaim) and its is not None and its.said.prediction.is_out_of_view
+    if before.is_out_of_view or hidden_from_other:  # pictures of two sizes need not show the same
         return None, 0.0, ""
     if its is None:
         badness = own.said.score if math.isfinite(own.said.score) else -math.inf
@@ -351,14 +363,14 @@ def valued(
     if isinstance(claim, ChangeClaim):
         after = its.said.prediction
         text = f"{before.label} before and {after.label} after"
-        return float(as_claimed(claim.claim, before, after)), 0.0, text
+        return float(problems.as_claimed(claim.claim, before, after)), 0.0, text
     return (own.said.right - its.said.right + 1) / 2, 0.0, ""
 
 
-def _same_picture(_query: Query, picture: Tensor) -> Tensor:
+def _same_picture(_query: problems.Query, picture: Tensor) -> Tensor:
     return picture.clone()
 
 
 def spp_of(config: SceneConfig) -> int:
     assert isinstance(config, suites.DrawnConfig)
-    return ladder_of(AttackConfig.of(config, verify_spp=config.verify_spp))[0]
+    return problems.ladder_of(AttackConfig.of(config, verify_spp=config.verify_spp))[0]

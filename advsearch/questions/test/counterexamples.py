@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import io
 import json
 import lzma
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isqrt
@@ -15,32 +17,29 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
+from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from advsearch import seeds
-from advsearch.attacks.verification import LEAST_RATE, OVER_CONDITIONS
-from advsearch.config import SceneConfig
-from advsearch.engine.loading import Scene
-from advsearch.engine.problem import Problem
-from advsearch.engine.verifier import kept_configuration
-from advsearch.errors import FileFormatError, InputError
-from advsearch.options import OUT_OF_VIEW
-from advsearch.questions.attack.carry_out import parts_in, problem_of_parts
-from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import attack_of
+from advsearch.extend import (
+    AttackConfig,
+    FileFormatError,
+    InputError,
+    Judgement,
+    Problem,
+    RunDirectory,
+    SceneConfig,
+    SceneDescription,
+    find_run,
+    problems,
+    seeds,
+    settings,
+    statistics,
+    stored_files,
+    writing,
+)
 from advsearch.questions.test.result import FAILED, HELD, UNDECIDED, VERDICTS
 from advsearch.questions.test.settings import Suite
-from advsearch.runs.directory import IMAGES, PARTS, default_name, find_run
-from advsearch.runs.files import read_png
-from advsearch.runs.summary import changed_file, file_digests
-from advsearch.settings import FILES, settings
-from advsearch.settings.configuration import PLACE
-from advsearch.statistics.intervals import clopper_pearson
-from advsearch.tasks import Judgement
-from advsearch.trust.stored_files import parse_json, read_text
-from advsearch.trust.writing import write_bytes, write_text
-from advsearch.viewer.thumbnails import thumbnail
 
 Floats: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
 
@@ -53,6 +52,7 @@ FORMS = ((True, 4), (True, 2), (True, 1), (False, 1))
 side of the squares of texels that have one."""
 
 PICTURE = ".jpg"  # how the name of the picture ends
+THUMBNAIL_SIDE = 128  # longest side of the picture, pixels
 LARGEST = 1 << 24  # most bytes of a file, and most numbers of a configuration
 MEMORY = 1 << 27  # bytes that unpacking one may take
 TRIALS = {False: 6, True: 20}  # fresh renders that try one, and one that has to hold under many conditions
@@ -60,7 +60,7 @@ TRIALS = {False: 6, True: 20}  # fresh renders that try one, and one that has to
 OF_MODEL = ("model", "labels", "prompt", "value_range", "ask", "ensemble")
 """Settings that say which network is tested. They go together: all are the suite's where it names a model."""
 
-OF_SUITE = (*PLACE, "threads", "deterministic", "workers", "cluster", "seconds", "log")
+OF_SUITE = (*settings.PLACE, "threads", "deterministic", "workers", "cluster", "seconds", "log")
 """Settings that say how and where is worked."""
 
 OF_SEARCH = (
@@ -155,12 +155,13 @@ class Counterexample:
         if "model" not in network:
             network = {}
         replaced = (*OF_SUITE, *OF_MODEL) if network else OF_SUITE
-        defaults = {setting.name: setting.default for setting in settings(AttackConfig) if setting.name in replaced}
+        declared = settings.settings(AttackConfig)
+        defaults = {setting.name: setting.default for setting in declared if setting.name in replaced}
         return AttackConfig(**{**self.config.plain(), **defaults, **network, **changed})
 
     def changed_file(self, config: AttackConfig) -> str | None:
         """Return the name of a file that its settings name and that is another one now; None where all are the same."""
-        return changed_file([self.files], deciding_settings(config))
+        return RunDirectory.find_changed_file([self.files], deciding_settings(config))
 
     def configuration(self, start: Tensor) -> Tensor:
         if start.numel() != len(self.moved):
@@ -175,8 +176,8 @@ def folder_of(suite: str) -> Path:
     return Path(suite).with_suffix(".counterexamples")
 
 
-def scene_digest(scene: Scene) -> str:
-    described, digest = scene.description, hashlib.sha256()
+def scene_digest(described: SceneDescription) -> str:
+    digest = hashlib.sha256()
     mesh, light = described.object.mesh, described.environment
     for array in (mesh.vertices, mesh.faces, mesh.uvs, described.object.base_color, light.radiance if light else None):
         digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
@@ -194,7 +195,7 @@ def relative_to_here(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings with the files below the current folder relative to it, so that a suite can be moved."""
     here = os.getcwd()
     relative = dict(values)
-    for name in FILES:
+    for name in settings.FILES:
         path = relative.get(name)
         if isinstance(path, str) and os.path.isabs(path) and Path(path).is_relative_to(here):
             relative[name] = os.path.relpath(path, here)
@@ -204,7 +205,7 @@ def relative_to_here(values: Mapping[str, Any]) -> dict[str, Any]:
 def outcome_of(trial: Judgement, clean: Judgement | None = None) -> bool | None:
     """Return whether the model is right in a trial, or None where the trial does not count: nothing of the object is in
     the picture, or the model is wrong on the clean scene under the same conditions."""
-    if trial.prediction.label == OUT_OF_VIEW or (clean is not None and not clean.right):
+    if trial.prediction.is_out_of_view or (clean is not None and not clean.right):
         return None
     return trial.right
 
@@ -220,10 +221,10 @@ def decide_trials(right: int, wrong: int, *, over: bool) -> str:
         if total < TRIALS[over] or (right and wrong):
             return UNDECIDED
         return HELD if right else FAILED
-    if total and clopper_pearson(wrong, total)[0] >= LEAST_RATE:
+    if total and statistics.intervals.clopper_pearson(wrong, total)[0] >= problems.LEAST_RATE:
         return FAILED
-    enough = total >= OVER_CONDITIONS.fewest
-    return HELD if enough and right >= OVER_CONDITIONS.share(total) else UNDECIDED
+    enough = total >= problems.OVER_CONDITIONS.fewest
+    return HELD if enough and right >= problems.OVER_CONDITIONS.share(total) else UNDECIDED
 
 
 def _is_wrong_on(example: Counterexample, problem: Problem, trials: int, *, over: bool) -> bool:
@@ -247,24 +248,26 @@ def add(suite: str, run: str) -> Counterexample:
     """Keep the adversarial scene of a run as a counterexample of a suite; an InputError where the run found nothing, or
     its scene is none."""
     path = find_run(run)
-    summary = attack_of(path)
+    summary = problems.attack_of(path)
     if summary.ending != "found" or summary.verified is None:
         raise InputError(f"add: expected a run that ended as 'found', got {path}, which ended with {summary.ending!r}")
     if summary.minimises:
         raise InputError(f"add: expected a run that makes the model wrong, got {path}, which makes the object easier")
-    parts = parts_in(path)
-    problem, _ = problem_of_parts(parts)
-    moved = (kept_configuration(path, problem) - problem.domain.start).numpy()
-    of = path.parents[1].name if path.parent.name == PARTS else ""
-    folder, name = folder_of(suite), default_name(of or path.name, (path.name,) if of else ())
+    parts = problems.parts_in(path)
+    problem, _ = problems.problem_of_parts(parts)
+    moved = (problems.kept_configuration(path, problem) - problem.domain.start).numpy()
+    folder = folder_of(suite)
+    study = path.parent.parent
+    is_part = path == RunDirectory.locate_part(study, path.name)
+    name = _make_name(study.name, path.name) if is_part else _make_name(path.name)
     config = parts.config.to_repeat()
     kept = {name: value for name, value in config.plain().items() if name not in NOT_DECIDING}
     values: dict[str, Any] = {"schema": 1, "run": path.name, "said": next(iter(summary.verified.labels), "")}
     values["settings"] = relative_to_here(kept)
-    values["files"] = file_digests(relative_to_here(deciding_settings(config)))
-    values |= {"scene": scene_digest(parts.scene), "spp": summary.verified.spp}
+    values["files"] = RunDirectory.digest_files(relative_to_here(deciding_settings(config)))
+    values |= {"scene": scene_digest(parts.scene.description), "spp": summary.verified.spp}
     folder.mkdir(parents=True, exist_ok=True)
-    write_bytes(folder / f"{name}{PICTURE}", thumbnail(read_png(path / IMAGES / "adversarial.png")))
+    writing.write_bytes(folder / f"{name}{PICTURE}", _make_thumbnail(path / "images" / "adversarial.png"))
     blocks = [block.size for block in problem.domain.blocks]
     forms = FORMS if max(blocks) > FEW else FORMS[-1:]
     over = is_over(config)
@@ -272,10 +275,29 @@ def add(suite: str, run: str) -> Counterexample:
     for form in forms:
         parted = [_Block.of(part, *form) for part in np.split(moved, np.cumsum(blocks)[:-1])]
         text = json.dumps({**values, "blocks": [block.model_dump() for block in parted]}, indent=1)
-        example = _read(write_text(folder / f"{name}.json", text + "\n"))
+        example = _read(writing.write_text(folder / f"{name}.json", text + "\n"))
         if form == forms[-1] or _is_wrong_on(example, problem, trials, over=over):
             break
     return example
+
+
+def _make_name(*names: str) -> str:
+    """Return a name for a file: ``mug-texture-001`` of the run ``mug-texture-001``."""
+    words = [Path(names[0]).stem, *names[1:]]
+    return re.sub(r"[^a-z0-9]+", "-", "-".join(words).lower()).strip("-")[:80] or "attack"
+
+
+def _make_thumbnail(path: Path) -> bytes:
+    """Return a small JPEG of a PNG picture. Raises FileFormatError: it is damaged."""
+    buffer = io.BytesIO()
+    try:
+        with Image.open(path, formats=("PNG",)) as image:
+            small = image.convert("RGB")
+            small.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FileFormatError(f"{path}: expected a PNG picture, got {error}") from None
+    small.save(buffer, "JPEG", quality=85)
+    return buffer.getvalue()
 
 
 def remove(example: Counterexample) -> None:
@@ -290,7 +312,7 @@ def counterexamples(suite: str) -> list[Counterexample]:
 
 def _read(path: Path) -> Counterexample:
     try:
-        kept = _File.model_validate(parse_json(read_text(path, "a counterexample", LARGEST)))
+        kept = _File.model_validate(stored_files.parse_json(stored_files.read_text(path, "a counterexample", LARGEST)))
         moved = np.concatenate([block.moved() for block in kept.blocks])
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
@@ -314,7 +336,7 @@ def read_expected(suite: str) -> dict[str, str]:
     if not path.is_file():
         return {}
     try:
-        values = parse_json(read_text(path, "what is expected of a suite", LARGEST))
+        values = stored_files.parse_json(stored_files.read_text(path, "what is expected of a suite", LARGEST))
     except (OSError, ValueError) as error:
         raise FileFormatError(f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it") from None
     verdicts = values.get("expected") if isinstance(values, dict) else None
@@ -328,7 +350,7 @@ def write_expected(suite: str, verdicts: Mapping[str, str]) -> list[str]:
     before, folder = read_expected(suite), folder_of(suite)
     kept = {name: verdict for name, verdict in sorted({**before, **verdicts}.items()) if verdict != HELD}
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / EXPECTED, json.dumps({"schema": 1, "expected": kept}, indent=1) + "\n")
+    writing.write_text(folder / EXPECTED, json.dumps({"schema": 1, "expected": kept}, indent=1) + "\n")
     changed = {name: (before.get(name, HELD), verdict) for name, verdict in verdicts.items()}
     return [f"{name}: {was} -> {now}" for name, (was, now) in changed.items() if was != now]
 

@@ -7,30 +7,32 @@ import re
 from collections.abc import Iterator, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 from urllib.parse import quote
 from xml.etree import ElementTree
 
 from pydantic import Field
 
-from advsearch import __version__
-from advsearch.config import SceneConfig
-from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.sweep.settings import BLIND, HARMLESS
-from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim
-from advsearch.report.shown import Claim, InNotebook, Kind, Picture, ResultPart, ShownResult
-from advsearch.report.wording import (
-    count,
-    interval_text,
-    number_text,
-    outcomes_text,
-    percent,
-    seconds_text,
-    short_name,
-    with_article,
+from advsearch.extend import (
+    AttackConfig,
+    Claim,
+    Fields,
+    InNotebook,
+    Interval,
+    Picture,
+    ResultPart,
+    RunResult,
+    SceneConfig,
+    ShownResult,
+    SweepConfig,
+    __version__,
+    results,
+    wording,
 )
-from advsearch.runs.results import INTERRUPTED, RUNNING, Fields, Interval, JsonFloat, RunResult, VerifiedRate, optional
+from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim
+
+if TYPE_CHECKING:
+    from advsearch.extend import problems
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"
 VERDICTS = (HELD, UNDECIDED, FAILED)  # from the best to the worst
@@ -58,19 +60,19 @@ class ClaimResult(Fields):
     reason: str = Field(description="why, with the numbers")
     expected: str = Field(HELD, description="what it said when `update` was given last; absent for `held`")
     pictures: int = Field(0, description="that it took; absent if none")
-    rate: JsonFloat | None = optional(
+    rate: results.JsonFloat | None = results.optional(
         "share of right predictions, or of pictures as claimed; of two models the difference; absent of a search"
     )
-    interval: Interval | None = optional(
+    interval: Interval | None = results.optional(
         "of it: each end holds at all times together, at the suite's confidence; of a counterexample that "
         "of Clopper and Pearson, 95 %"
     )
-    spp: int | None = optional("samples a pixel of the pictures; absent of a search")
-    picture: str | None = optional("a picture that the model gets wrong, in the run's folder")
-    part: str | None = optional("the run in `parts` that has the search; absent without one")
+    spp: int | None = results.optional("samples a pixel of the pictures; absent of a search")
+    picture: str | None = results.optional("a picture that the model gets wrong, in the run's folder")
+    part: str | None = results.optional("the run in `parts` that has the search; absent without one")
     repeat: str = Field("", description="the command that repeats it; absent where there is none")
-    seconds: JsonFloat = Field(0.0, description="that it took")
-    cause: Cause | None = optional(
+    seconds: results.JsonFloat = Field(0.0, description="that it took")
+    cause: Cause | None = results.optional(
         "`counterexample failed`, `interrupted`, `not reached` or `out of time`: why it is undecided; absent elsewhere"
     )
 
@@ -93,7 +95,7 @@ class SuiteResult(InNotebook, RunResult):
     )
     confidence: float = Field(description="of each claim that is decided by drawn pictures")
     claims: list[ClaimResult]
-    added: str | None = optional("the file of the counterexample that was added; only with `add`")
+    added: str | None = results.optional("the file of the counterexample that was added; only with `add`")
     changes: list[str] = Field([], description="what is expected from now on; only with `update`")
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
@@ -139,22 +141,26 @@ def shown(result: SuiteResult) -> ShownResult:
 
 
 def statement(claim: AnyClaim, config: SceneConfig) -> str:
-    what = f"{short_name(config.object)}, {', '.join(config.controls)}"
+    what = f"{wording.short_name(config.object)}, {', '.join(config.controls)}"
     if isinstance(claim, RightClaim):
         spanned = "the frames" if "path" in config.controls else "the pictures"
-        share = f"at least {percent(claim.at_least)} of {spanned} that the ranges span"
-        return f"{short_name(config.model)} is right in {share}: {what}"
+        share = f"at least {wording.percent(claim.at_least)} of {spanned} that the ranges span"
+        return f"{wording.short_name(config.model)} is right in {share}: {what}"
     if isinstance(claim, ChangeClaim):
         says = "says something else" if claim.claim == "must_change" else "says the same"
-        when = f"{(BLIND | HARMLESS)[claim.when]}, in at least {percent(claim.at_least)} of pictures"
-        return f"{short_name(config.model)} {says} when {when}: {what}"
+        changes = {**SweepConfig.blind_changes, **SweepConfig.harmless_changes}
+        when = f"{changes[claim.when]}, in at least {wording.percent(claim.at_least)} of pictures"
+        return f"{wording.short_name(config.model)} {says} when {when}: {what}"
     if isinstance(claim, NoWorseClaim):
-        points = f"{number_text(claim.points)} points"
-        models = f"{short_name(config.model)} is right at most {points} less often than {short_name(claim.than)}"
+        points = f"{wording.number_text(claim.points)} points"
+        model, other = wording.short_name(config.model), wording.short_name(claim.than)
+        models = f"{model} is right at most {points} less often than {other}"
         return f"{models} on the same pictures of {what}"
     epsilon = getattr(config, "epsilon", None)
-    within = "" if epsilon is None else f" within {number_text(epsilon) if isinstance(epsilon, float) else epsilon}"
-    return f"no search finds a picture that {short_name(config.model)} gets wrong: {what}{within}"
+    within = (
+        "" if epsilon is None else f" within {wording.number_text(epsilon) if isinstance(epsilon, float) else epsilon}"
+    )
+    return f"no search finds a picture that {wording.short_name(config.model)} gets wrong: {what}{within}"
 
 
 def share_reason(
@@ -163,9 +169,9 @@ def share_reason(
     """Return why a claim about a share is held, failed or undecided, with the interval at all times together. `what` is
     so in `right` of the pictures; `worst` says where it was not, and is empty where it always was. `outcomes` says what
     became of the object in the other pictures where a detector is judged."""
-    said = f"{what} in {right} of {pictures} (interval {interval_text(interval)})" if pictures else "no picture"
+    said = f"{what} in {right} of {pictures} (interval {wording.interval_text(interval)})" if pictures else "no picture"
     said += f"; {outcomes}" if outcomes else ""
-    more = f"; not decided after {count(pictures, 'picture')}" if verdict == UNDECIDED else ""
+    more = f"; not decided after {wording.count(pictures, 'picture')}" if verdict == UNDECIDED else ""
     return said + more + (f"; {worst}" if worst else "")
 
 
@@ -177,25 +183,25 @@ def difference_reason(verdict: str, counts: tuple[int, int, int], interval: tupl
         return "no picture"
     ends = " to ".join(f"{100.0 * end:+.1f}" for end in interval)
     said = (
-        f"of {count(pictures, 'picture')} it alone is right in {ours}, {short_name(than)} alone in {theirs} "
+        f"of {wording.count(pictures, 'picture')} it alone is right in {ours}, "
+        f"{wording.short_name(than)} alone in {theirs} "
         f"(difference {100.0 * (ours - theirs) / pictures:+.1f} points, interval {ends})"
     )
-    return said + (f"; not decided after {count(pictures, 'picture')}" if verdict == UNDECIDED else "")
+    return said + (f"; not decided after {wording.count(pictures, 'picture')}" if verdict == UNDECIDED else "")
 
 
-def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, str, Cause | None]:
+def search_verdict(summary: problems.AttackSummary, config: AttackConfig) -> tuple[str, str, Cause | None]:
     """Return the verdict of a search, its reason, and the cause where the search is not at its end."""
     verified, clean = summary.verified, summary.clean.control
     if summary.ending == "already wrong":
         right = "" if clean is None else f": right in {clean.correct} of {clean.trials} trials"
         if clean is not None and clean.outcomes:
-            right += f", {outcomes_text(clean.outcomes, summary.task)}"
+            right += f", {wording.outcomes_text(clean.outcomes, summary.task)}"
         return FAILED, f"wrong on the clean scene already{right}", None
     if summary.ending == "found" and verified is not None:
         called = how_wrong(summary.task, verified)
-        wrong = (
-            f"wrong in {verified.successes} of {verified.trials} trials (interval {interval_text(verified.interval)})"
-        )
+        interval = wording.interval_text(verified.interval)
+        wrong = f"wrong in {verified.successes} of {verified.trials} trials (interval {interval})"
         return FAILED, f"a verified counterexample: {wrong}{called}", None
     if summary.goes_on:
         return UNDECIDED, STOPPED, Cause.INTERRUPTED
@@ -206,16 +212,16 @@ def search_verdict(summary: AttackSummary, config: AttackConfig) -> tuple[str, s
     if config.seconds is not None and asked is not None and summary.steps < asked:
         return UNDECIDED, f"{TIME_OVER} after {summary.steps} of {asked} steps", Cause.OUT_OF_TIME
     beside = "" if summary.baseline is None else ", nor by as many random renders"
-    steps = count(summary.steps, "step")
+    steps = wording.count(summary.steps, "step")
     return HELD, f"not broken by {steps} of {summary.policy}{beside}; this is no proof", None
 
 
-def how_wrong(task: str, verified: VerifiedRate) -> str:
+def how_wrong(task: str, verified: results.VerifiedRate) -> str:
     """Return what the model most often says in trials that are successes, as the end of a sentence."""
     label = next(iter(verified.labels), "")
     if verified.outcomes:
-        return f": {outcomes_text(verified.outcomes, task)}"
-    return f", most often {with_article(label)}" if label else ""
+        return f": {wording.outcomes_text(verified.outcomes, task)}"
+    return f", most often {wording.with_article(label)}" if label else ""
 
 
 def cannot_be_judged(error: str) -> str:
@@ -249,12 +255,12 @@ def tried_reason(
             return f"none of {uncounted} conditions counts: the clean scene is wrong, or the object not to be seen"
         return "nothing of the object is to be seen" if uncounted else TIME_OVER
     if not wrong:
-        text = f"right in {right} of {right} {what} (interval {interval_text(interval)})"
+        text = f"right in {right} of {right} {what} (interval {wording.interval_text(interval)})"
     else:
         low, high = interval
-        ends = interval_text((1.0 - high, 1.0 - low))
+        ends = wording.interval_text((1.0 - high, 1.0 - low))
         text = f"wrong in {wrong} of {total} {what} (interval {ends})"
-        text += f": {outcomes}" if outcomes else f", {with_article(label)}"
+        text += f": {outcomes}" if outcomes else f", {wording.with_article(label)}"
     if verdict == UNDECIDED and right and wrong:
         text += ": it depends on the conditions" if over else ": it depends on the noise"
     why = "the clean scene is wrong, or the object not to be seen" if over else "the object is not to be seen"
@@ -276,30 +282,33 @@ def suite_text(result: SuiteResult) -> str:
         return f"Kept as {result.added}."
     known = sum(claim.answer != HELD and claim.accepted for claim in result.claims)
     beside = f", {known} of them as expected" if known else ""
-    said = {RUNNING: "Running, so far", INTERRUPTED: "Stopped, so far"}.get(result.ending, result.answer.capitalize())
+    said = {results.RUNNING: "Running, so far", results.INTERRUPTED: "Stopped, so far"}.get(
+        result.ending, result.answer.capitalize()
+    )
     return f"{said}: {result.brief or 'no claims'}{beside}."
 
 
 def facts(result: SuiteResult) -> dict[str, str]:
     return {
         "model": result.model,
-        "confidence": f"{percent(result.confidence)} for each claim that pictures decide",
+        "confidence": f"{wording.percent(result.confidence)} for each claim that pictures decide",
         "pictures": str(sum(claim.pictures for claim in result.claims)),
         "seed": str(result.seed),
-        "time": seconds_text(result.seconds["total"]),
+        "time": wording.seconds_text(result.seconds["total"]),
     }
 
 
 def claims(result: SuiteResult) -> Iterator[Claim]:
     for tried in result.claims:
         text = f"{tried.name}: that {tried.statement} is {tried.answer}: {tried.reason}."
-        kind: Kind = "nothing claimed" if tried.answer == UNDECIDED else "measured"
-        if tried.kind in ("not_broken", "counterexample") and tried.answer != UNDECIDED:
-            kind = "found" if tried.answer == FAILED else "not found"
-        elif kind == "measured":
-            sure = percent(result.confidence)
+        if tried.answer == UNDECIDED:
+            yield Claim(kind="nothing claimed", statement=text, extent=None)
+        elif tried.kind in ("not_broken", "counterexample"):
+            yield Claim(kind="found" if tried.answer == FAILED else "not found", statement=text, extent=None)
+        else:
+            sure = wording.percent(result.confidence)
             text += f" Each end of the interval is a confidence sequence at {sure}, in place of Clopper-Pearson's."
-        yield Claim(kind=kind, statement=text, extent=None)
+            yield Claim(kind="measured", statement=text, extent=None)
 
 
 SARIF_SCHEMA = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,23 +10,20 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from advsearch.config import SceneConfig
-from advsearch.errors import FileFormatError, InputError, resembling
-from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.sweep.settings import BLIND, HARMLESS
-from advsearch.settings import (
+from advsearch.extend import (
+    AttackConfig,
     Clash,
     Config,
-    each_once,
-    read_yaml,
+    FileFormatError,
+    InputError,
+    SceneConfig,
+    SweepConfig,
     setting,
     setting_as_in,
-    shown,
-    split_names,
-    texts,
+    settings,
 )
-from advsearch.settings.configuration import PLACE
-from advsearch.trust import powers
+
+powers = settings.powers
 
 
 class SuiteConfig(Config):
@@ -86,12 +84,12 @@ class SuiteConfig(Config):
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
     # fmt: on
 
-    _named = texts("suite", "add", "model", "junit", "sarif", "markdown", "run", several=["only"])
-    _different = each_once("only")
+    _named = settings.texts("suite", "add", "model", "junit", "sarif", "markdown", "run", several=["only"])
+    _different = settings.each_once("only")
 
     @property
     def chosen(self) -> tuple[str, ...]:
-        return () if self.only is None else split_names(self.only)
+        return () if self.only is None else settings.split_names(self.only)
 
     @property
     def title(self) -> tuple[str, ...]:
@@ -109,7 +107,7 @@ class DrawnConfig(SceneConfig):
     )
 
 
-OWN = (*PLACE, "seed", "threads", "deterministic", "workers", "cluster", "seconds")
+OWN = (*settings.PLACE, "seed", "threads", "deterministic", "workers", "cluster", "seconds")
 """Settings that the suite or its command says for all claims."""
 
 PICTURES, MOST = 400, 1_000_000  # pictures that a claim may take, and the most that it may ask for
@@ -122,7 +120,10 @@ EXPECTED = {
     "at_least": "a share over 0 and under 1, such as 0.95",
     "points": "percentage points over 0 and under 100, such as 2",
     "pictures": f"a whole number from 1 to {MOST}",
-    "when": f"{', '.join(BLIND)} of must_change, and {', '.join(HARMLESS)} of must_not_change",
+    "when": (
+        f"{', '.join(SweepConfig.blind_changes)} of must_change, and {', '.join(SweepConfig.harmless_changes)} of "
+        "must_not_change"
+    ),
     "than": "another model, by its name or its file",
     "confidence": "a number from 0.5 to 0.9999, such as 0.95",
     "seconds": "a number of seconds over 0",
@@ -180,14 +181,14 @@ class RightClaim(ShareClaim):
 
 class MustChangeClaim(ShareClaim):
     """The model says something else where there is nothing left to see: a model that does not is not looking. `when` is
-    what is done to the picture, a name of `BLIND`."""
+    what is done to the picture, a name of `SweepConfig.blind_changes`."""
 
     claim: Literal["must_change"]
     when: Literal["black", "covered", "away"]
 
 
 class MustNotChangeClaim(ShareClaim):
-    """The model says the same where a change means nothing; `when` is a name of `HARMLESS`."""
+    """The model says the same where a change means nothing; `when` is a name of `SweepConfig.harmless_changes`."""
 
     claim: Literal["must_not_change"]
     when: Literal["exposure", "shift", "jpeg"]
@@ -234,7 +235,7 @@ class Suite(_FromYaml):
     def _names(cls, value: dict[str, AnyClaim]) -> dict[str, AnyClaim]:
         for name in value:
             if not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,59}", name) or name == COUNTEREXAMPLES:
-                raise ValueError(f"expected names of small letters, digits and hyphens, got {shown(name)}")
+                raise ValueError(f"expected names of small letters, digits and hyphens, got {settings.shown(name)}")
         return value
 
     def config_of(self, name: str, **changes: object) -> SceneConfig:
@@ -252,7 +253,7 @@ class Suite(_FromYaml):
 
 
 def read_suite(path: str | Path) -> Suite:
-    return suite_of(read_yaml(path), str(path))
+    return suite_of(settings.read_yaml(path), str(path))
 
 
 def suite_of(data: Mapping[str, object], where: str) -> Suite:
@@ -267,17 +268,19 @@ def suite_of(data: Mapping[str, object], where: str) -> Suite:
 
 
 def _told(error: Any) -> str:
-    kind, place, got = error["type"], [str(part) for part in error["loc"] if part not in KINDS], shown(error["input"])
+    kind = error["type"]
+    place = [str(part) for part in error["loc"] if part not in KINDS]
+    got = settings.shown(error["input"])
     if place[-1] == "[key]":  # a name that is a number
         return f"{place[0]}: expected names of small letters, digits and hyphens, got {got}; put it in quotes"
     if kind.startswith("union_tag"):
         place.append("claim")
-        got = "nothing" if kind == "union_tag_not_found" else shown(error["ctx"]["tag"])
+        got = "nothing" if kind == "union_tag_not_found" else settings.shown(error["ctx"]["tag"])
     where, name = ".".join(place), place[-1]
     if kind == "extra_forbidden":
         if name in EXPECTED:
             return f"{where}: {'a claim of this kind' if len(place) > 2 else 'a suite'} has no {name}; leave it out"
-        near = resembling(name, sorted(EXPECTED))[:1]
+        near = difflib.get_close_matches(name, sorted(EXPECTED), 1)
         guess = f"did you mean {near[0]}?" if near else "docs/testing.md has the names"
         return f"{where}: there is no such name in a suite, or in a claim of this kind; {guess}"
     if kind == "value_error":

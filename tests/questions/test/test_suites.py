@@ -25,6 +25,7 @@ import yaml
 from torch import Tensor
 
 import advsearch
+from advsearch.api import problems
 from advsearch.cli.main import main
 from advsearch.cluster import InProcess
 from advsearch.engine.image_changes import CHANGED
@@ -40,7 +41,6 @@ from advsearch.questions.report.recorded import made_with, recorded_settings
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.test import claims
 from advsearch.questions.test import result as words
-from advsearch.questions.test.carry_out import test_from_config as carry_out
 from advsearch.questions.test.counterexamples import (
     NOT_DECIDING,
     OF_MODEL,
@@ -54,6 +54,7 @@ from advsearch.questions.test.counterexamples import (
 from advsearch.questions.test.counterexamples import _Block as Block
 from advsearch.questions.test.result import ClaimResult, SuiteResult
 from advsearch.questions.test.settings import NoWorseClaim, SuiteConfig, suite_of
+from advsearch.registry import get_experiment
 from advsearch.runs.listing import listed_run
 from advsearch.runs.store import Store
 from advsearch.runs.summary import read_result
@@ -63,6 +64,7 @@ from advsearch.tasks import Judgement, Prediction
 from advsearch.testing import assert_no_worse, assert_not_broken, assert_right, assert_suite
 from advsearch.viewer.server import following_page
 
+carry_out = get_experiment("test").run
 EASY, HARD = "small_models:easy", "small_models:hard"
 SMALL: dict[str, Any] = {"resolution": 32, "denoise": "none"}
 FRONT: dict[str, Any] = {"light": {}}
@@ -249,7 +251,7 @@ def worked(config: AttackConfig, function: str, *more: Any) -> Iterator[InProces
 def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictures(
     workers: int | None, tested: tuple[SuiteResult, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(claims, "executor_for", worked)
+    monkeypatch.setattr(problems, "executor_for", worked)
     chosen, suite = ("in-front", "no-worse", "too-few"), written(tmp_path, CLAIMS)
     config = SuiteConfig(suite=suite, only=",".join(chosen), workers=workers, run=str(tmp_path / "run"))
     whole = {one.name: (one.answer, one.reason, one.interval) for one in tested[0].claims if one.name in chosen}
