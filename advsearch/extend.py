@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from advsearch import seeds as seeds
     from advsearch import settings as settings
     from advsearch import statistics as statistics
-    from advsearch.api import problems as problems
+    from advsearch.api import workbench as workbench
     from advsearch.attacks import Domain as Domain
     from advsearch.attacks import Evaluation as Evaluation
     from advsearch.attacks import Policy as Policy
@@ -104,13 +104,13 @@ _MODULES = {
     "color": "advsearch.scene.color",
     "figures": "advsearch.report.figures",
     "geometry": "advsearch.scene.geometry",
-    "problems": "advsearch.api.problems",
     "results": "advsearch.runs.results",
     "seeds": "advsearch.seeds",
     "settings": "advsearch.settings",
     "statistics": "advsearch.statistics",
     "stored_files": "advsearch.trust.stored_files",
     "wording": "advsearch.report.wording",
+    "workbench": "advsearch.api.workbench",
     "writing": "advsearch.trust.writing",
 }
 """Modules of functions that belong to the interface as a whole."""

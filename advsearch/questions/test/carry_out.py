@@ -16,8 +16,8 @@ from advsearch.extend import (
     SceneConfig,
     Store,
     UnknownNameError,
-    problems,
     results,
+    workbench,
 )
 from advsearch.questions.test import counterexamples, settings
 from advsearch.questions.test.claims import Trial, check_pictures
@@ -269,7 +269,7 @@ def _check(planned: Sequence[PlannedClaim], suite: Suite) -> list[str]:
         for wanted in (config, *than):
             if wanted not in known:
                 try:
-                    problems.check_from_config(wanted)
+                    workbench.check_from_config(wanted)
                 except InputError as error:
                     raise InputError(f"claims.{each.name}: {error}") from None
                 known.append(wanted)

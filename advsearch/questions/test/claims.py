@@ -23,11 +23,11 @@ from advsearch.extend import (
     RunContext,
     RunDirectory,
     SceneConfig,
-    problems,
     seeds,
     settings,
     statistics,
     wording,
+    workbench,
 )
 from advsearch.questions.test import result as words
 from advsearch.questions.test import settings as suites
@@ -44,7 +44,7 @@ from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClai
 
 MANY = 4  # values of a configuration that are said in words, at most
 MOST_KEPT = 64  # of a configuration with more numbers, a picture's row does not hold the values
-ChangePicture = Callable[["problems.Query", Tensor], Tensor]
+ChangePicture = Callable[["workbench.Query", Tensor], Tensor]
 """Goes from a query and its picture to the picture that the other side is shown."""
 AHEAD = 2  # pictures that are asked for at once, for each worker
 ATTACK_WORKER = "advsearch.questions.attack.carry_out:attack_worker"
@@ -93,7 +93,7 @@ class Trial:
         limited = {**shared, "seconds": seconds if math.isfinite(seconds) else None}
         own = config.model_copy(update=limited).with_only_here(config.only_here)
         summary = self.context.run_part(asked.name, own)
-        assert isinstance(summary, problems.AttackSummary)
+        assert isinstance(summary, workbench.AttackSummary)
         self.warnings += summary.warnings
         planned = own.model_copy(update={"steps": own.steps or summary.steps})
         verdict, reason, cause = words.search_verdict(summary, planned)
@@ -122,15 +122,15 @@ class Trial:
             shown = self._changed(claim, config, problem)
         sequence, least = statistics.sequential.ConfidenceSequence(self.suite.confidence, sides=1), least_mean(claim)
         values, hidden, verdict = list[float](), 0, UNDECIDED
-        worst: tuple[float, problems.Query, str] | None = None
+        worst: tuple[float, workbench.Query, str] | None = None
         wrong_payloads: list[Any] = []
         self.progress.stage(asked.name, claim.pictures, hint="fewer pictures in the suite shorten it", at_most=True)
-        with problems.executor_for(shared, worker, self.progress) as executor:
-            journal = problems.Journal(self.run, problems.Shared(problem, executor, "0" if several else ""))
+        with workbench.executor_for(shared, worker, self.progress) as executor:
+            journal = workbench.Journal(self.run, workbench.Shared(problem, executor, "0" if several else ""))
             beside = None
             if not isinstance(claim, RightClaim):
-                shared_by_workers = problems.Shared(other, executor, "1") if several else problems.Shared(other)
-                beside = problems.Journal(self.run, shared_by_workers)
+                shared_by_workers = workbench.Shared(other, executor, "1") if several else workbench.Shared(other)
+                beside = workbench.Journal(self.run, shared_by_workers)
             for query, own, its in self._pairs(journal, drawn(problem, kind, claim.pictures, spp), beside, shown):
                 value, badness, text = valued(claim, own, its)
                 if value is None:
@@ -156,7 +156,7 @@ class Trial:
             what = "right" if isinstance(claim, RightClaim) else "as claimed"
             outcomes = ""
             if isinstance(claim, RightClaim):
-                outcomes = wording.outcomes_text(problems.count_outcomes(wrong_payloads), problem.task.name)
+                outcomes = wording.outcomes_text(workbench.count_outcomes(wrong_payloads), problem.task.name)
             reason = words.share_reason(what, verdict, values.count(1.0), len(values), interval, example, outcomes)
         reason += f"; the object is not to be seen in {hidden} more, which are not counted" if hidden else ""
         cause = Cause.OUT_OF_TIME if verdict == UNDECIDED and self.late else None
@@ -169,27 +169,27 @@ class Trial:
 
     def _changed(self, claim: ChangeClaim, config: SceneConfig, problem: Problem) -> ChangePicture:
         """Return what shows a model the changed picture of a query."""
-        if claim.when != problems.AWAY:
-            return lambda query, picture: problems.changed(picture, claim.when, problem.model.cameras)
+        if claim.when != workbench.AWAY:
+            return lambda query, picture: workbench.changed(picture, claim.when, problem.model.cameras)
         other = self._problem(config)
         other.renderer.scene.assembly.away = True
         return lambda query, picture: other.picture(query.u, query.seed, query.spp)
 
     def _pairs(
-        self, journal: problems.Journal, queries: Iterator[problems.Query], beside: problems.Journal | None = None,
+        self, journal: workbench.Journal, queries: Iterator[workbench.Query], beside: workbench.Journal | None = None,
         shown: ChangePicture | None = None,
-    ) -> Iterator[tuple[problems.Query, Evaluation, Evaluation | None]]:  # fmt: skip
+    ) -> Iterator[tuple[workbench.Query, Evaluation, Evaluation | None]]:  # fmt: skip
         """Yield queries, as many at once as there are workers for, until the time is over; with what is said of each,
         and what the other side says of what is `shown` to it of this picture; without, of a picture of its own."""
         pictures: dict[int, Tensor | None] = {}
 
-        def here(queries: Sequence[problems.Query]) -> Iterator[Evaluation]:
+        def here(queries: Sequence[workbench.Query]) -> Iterator[Evaluation]:
             evaluations = journal.traced([replace(query, keep=shown is not None) for query in queries])
             for query, evaluation in zip(queries, evaluations, strict=True):
                 pictures[query.number] = evaluation.picture
                 yield evaluation
 
-        def there(queries: Sequence[problems.Query]) -> Iterable[Evaluation]:
+        def there(queries: Sequence[workbench.Query]) -> Iterable[Evaluation]:
             assert beside is not None
             if shown is None:
                 yield from beside.traced(queries)
@@ -219,8 +219,8 @@ class Trial:
         """Try a counterexample: the model should be right on it. Trials by which it is added are no trials of it."""
         asked = asked.model_copy(update={"statement": f"{config.model} is right where it said {example.said}"})
         try:
-            parts = problems.parts_of(config)
-            problem = problems.problem_on(parts, differentiated=False)
+            parts = workbench.parts_of(config)
+            problem = workbench.problem_on(parts, differentiated=False)
         except InputError as error:
             return asked.model_copy(update={"reason": words.cannot_be_judged(str(error))})
         if file := example.changed_file(config):
@@ -234,7 +234,7 @@ class Trial:
         over = is_over(config)
         count = TRIALS[over]
         kind = f"{'added ' if self.config.add is not None else ''}counterexample {example.name}"
-        journal = problems.Journal(self.run, problems.Shared(problem))
+        journal = workbench.Journal(self.run, workbench.Shared(problem))
         outcomes = list[bool | None]()
         wrong_payloads: list[Any] = []
         label = ""
@@ -253,7 +253,7 @@ class Trial:
         verdict = decide_trials(right, wrong, over=over)
         interval = statistics.intervals.clopper_pearson(right, right + wrong) if right + wrong else None
         counts = (right, wrong, outcomes.count(None))
-        became = wording.outcomes_text(problems.count_outcomes(wrong_payloads), problem.task.name)
+        became = wording.outcomes_text(workbench.count_outcomes(wrong_payloads), problem.task.name)
         reason = words.tried_reason(verdict, counts, label, interval, over=over, outcomes=became)
         outcome: dict[str, Any] = {"pictures": len(outcomes), "spp": example.spp}
         if self.late and right + wrong < count and not (right and wrong and not over):
@@ -264,13 +264,13 @@ class Trial:
         return asked.model_copy(update={**outcome, "interval": interval})
 
     def _trials_of(
-        self, journal: problems.Journal, kind: str, u: Tensor, spp: int, *, over: bool
-    ) -> Iterator[tuple[problems.Query, Judgement, Judgement | None]]:
+        self, journal: workbench.Journal, kind: str, u: Tensor, spp: int, *, over: bool
+    ) -> Iterator[tuple[workbench.Query, Judgement, Judgement | None]]:
         """Yield trials of one configuration (d,), and of the clean scene in the same conditions where these vary."""
         problem = journal.problem
-        queries = list[problems.Query]()
+        queries = list[workbench.Query]()
         for number in range(2 * TRIALS[over]):
-            query = problems.Query(u, seeds.stream(self.suite.seed, kind, number), kind, number, spp=spp)
+            query = workbench.Query(u, seeds.stream(self.suite.seed, kind, number), kind, number, spp=spp)
             queries.append(query)
             if over:
                 queries.append(replace(query, u=problem.domain.start, kind=f"{kind}, clean"))
@@ -282,17 +282,17 @@ class Trial:
             yield query, trial.said, None if clean is None else clean[1].said
 
     def _problem(self, config: SceneConfig) -> Problem:
-        parts = problems.parts_of(AttackConfig.of(config))
+        parts = workbench.parts_of(AttackConfig.of(config))
         remarks = [*parts.loaded[1]]  # without those of the task, which stand in the reason
-        problem = problems.problem_on(parts, differentiated=False)
+        problem = workbench.problem_on(parts, differentiated=False)
         self.warnings += [*problem.space.notes(parts.scene.description), *remarks]
         return problem
 
-    def _picture(self, name: str, problem: Problem, query: problems.Query) -> str:
+    def _picture(self, name: str, problem: Problem, query: workbench.Query) -> str:
         picture = problem.picture(query.u, query.seed, query.spp, drawn=query.drawn)
         return self.run.save_image(name, picture).relative_to(self.run.path).as_posix()
 
-    def _described(self, problem: Problem, query: problems.Query) -> str:
+    def _described(self, problem: Problem, query: workbench.Query) -> str:
         values = list(problem.describe(query.u, query.seed).items())
         shown = []
         for name, value in values[:MANY]:
@@ -306,19 +306,19 @@ def claim_worker(values: dict[str, Any]) -> Callable[[Any], Any]:
 
     def load_problem(name: str) -> Problem:
         config = AttackConfig(**{**values, "model": models[int(name)]})
-        return problems.problem_on(problems.parts_of(config), differentiated=False)
+        return workbench.problem_on(workbench.parts_of(config), differentiated=False)
 
-    return problems.worker_call(cache(load_problem))
+    return workbench.worker_call(cache(load_problem))
 
 
-def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[problems.Query]:
+def drawn(problem: Problem, kind: str, count: int, spp: int) -> Iterator[workbench.Query]:
     """Draw configurations evenly from the whole space and budget, one after the other, each with a seed of its own."""
     for number in range(count):
         generator = torch.Generator().manual_seed(seeds.stream(problem.seed, f"{kind} draw", number))
         (u,) = problem.domain.sample(generator)
         seed = seeds.stream(problem.seed, kind, number)
         values = problem.describe(u, seed) if problem.domain.dim <= MOST_KEPT else {}
-        yield problems.Query(u, seed, kind, number, spp=spp, values=values, sought=False)
+        yield workbench.Query(u, seed, kind, number, spp=spp, values=values, sought=False)
 
 
 def least_mean(claim: ShareClaim | NoWorseClaim) -> float:
@@ -363,14 +363,14 @@ def valued(
     if isinstance(claim, ChangeClaim):
         after = its.said.prediction
         text = f"{before.label} before and {after.label} after"
-        return float(problems.as_claimed(claim.claim, before, after)), 0.0, text
+        return float(workbench.as_claimed(claim.claim, before, after)), 0.0, text
     return (own.said.right - its.said.right + 1) / 2, 0.0, ""
 
 
-def _same_picture(_query: problems.Query, picture: Tensor) -> Tensor:
+def _same_picture(_query: workbench.Query, picture: Tensor) -> Tensor:
     return picture.clone()
 
 
 def spp_of(config: SceneConfig) -> int:
     assert isinstance(config, suites.DrawnConfig)
-    return problems.ladder_of(AttackConfig.of(config, verify_spp=config.verify_spp))[0]
+    return workbench.ladder_of(AttackConfig.of(config, verify_spp=config.verify_spp))[0]

@@ -31,11 +31,11 @@ from advsearch.extend import (
     SceneConfig,
     SceneDescription,
     find_run,
-    problems,
     seeds,
     settings,
     statistics,
     stored_files,
+    workbench,
     writing,
 )
 from advsearch.questions.test.result import FAILED, HELD, UNDECIDED, VERDICTS
@@ -221,10 +221,10 @@ def decide_trials(right: int, wrong: int, *, over: bool) -> str:
         if total < TRIALS[over] or (right and wrong):
             return UNDECIDED
         return HELD if right else FAILED
-    if total and statistics.intervals.clopper_pearson(wrong, total)[0] >= problems.LEAST_RATE:
+    if total and statistics.intervals.clopper_pearson(wrong, total)[0] >= workbench.LEAST_RATE:
         return FAILED
-    enough = total >= problems.OVER_CONDITIONS.fewest
-    return HELD if enough and right >= problems.OVER_CONDITIONS.share(total) else UNDECIDED
+    enough = total >= workbench.OVER_CONDITIONS.fewest
+    return HELD if enough and right >= workbench.OVER_CONDITIONS.share(total) else UNDECIDED
 
 
 def _is_wrong_on(example: Counterexample, problem: Problem, trials: int, *, over: bool) -> bool:
@@ -248,14 +248,14 @@ def add(suite: str, run: str) -> Counterexample:
     """Keep the adversarial scene of a run as a counterexample of a suite; an InputError where the run found nothing, or
     its scene is none."""
     path = find_run(run)
-    summary = problems.attack_of(path)
+    summary = workbench.attack_of(path)
     if summary.ending != "found" or summary.verified is None:
         raise InputError(f"add: expected a run that ended as 'found', got {path}, which ended with {summary.ending!r}")
     if summary.minimises:
         raise InputError(f"add: expected a run that makes the model wrong, got {path}, which makes the object easier")
-    parts = problems.parts_in(path)
-    problem, _ = problems.problem_of_parts(parts)
-    moved = (problems.kept_configuration(path, problem) - problem.domain.start).numpy()
+    parts = workbench.parts_in(path)
+    problem, _ = workbench.problem_of_parts(parts)
+    moved = (workbench.kept_configuration(path, problem) - problem.domain.start).numpy()
     folder = folder_of(suite)
     study = path.parent.parent
     is_part = path == RunDirectory.locate_part(study, path.name)

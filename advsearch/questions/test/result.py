@@ -32,7 +32,7 @@ from advsearch.extend import (
 from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim
 
 if TYPE_CHECKING:
-    from advsearch.extend import problems
+    from advsearch.extend import workbench
 
 HELD, UNDECIDED, FAILED = "held", "undecided", "failed"
 VERDICTS = (HELD, UNDECIDED, FAILED)  # from the best to the worst
@@ -190,7 +190,7 @@ def difference_reason(verdict: str, counts: tuple[int, int, int], interval: tupl
     return said + (f"; not decided after {wording.count(pictures, 'picture')}" if verdict == UNDECIDED else "")
 
 
-def search_verdict(summary: problems.AttackSummary, config: AttackConfig) -> tuple[str, str, Cause | None]:
+def search_verdict(summary: workbench.AttackSummary, config: AttackConfig) -> tuple[str, str, Cause | None]:
     """Return the verdict of a search, its reason, and the cause where the search is not at its end."""
     verified, clean = summary.verified, summary.clean.control
     if summary.ending == "already wrong":

@@ -25,7 +25,7 @@ import yaml
 from torch import Tensor
 
 import advsearch
-from advsearch.api import problems
+from advsearch.api import workbench
 from advsearch.cli.main import main
 from advsearch.cluster import InProcess
 from advsearch.engine.image_changes import CHANGED
@@ -251,7 +251,7 @@ def worked(config: AttackConfig, function: str, *more: Any) -> Iterator[InProces
 def test_a_suite_that_was_stopped_goes_on_where_it_was_whoever_shares_its_pictures(
     workers: int | None, tested: tuple[SuiteResult, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(problems, "executor_for", worked)
+    monkeypatch.setattr(workbench, "executor_for", worked)
     chosen, suite = ("in-front", "no-worse", "too-few"), written(tmp_path, CLAIMS)
     config = SuiteConfig(suite=suite, only=",".join(chosen), workers=workers, run=str(tmp_path / "run"))
     whole = {one.name: (one.answer, one.reason, one.interval) for one in tested[0].claims if one.name in chosen}

@@ -1,0 +1,43 @@
+"""What experiments load and use: scenes, models, tasks and problems that settings name, attacks, and workers.
+
+    from advsearch.extend import workbench
+
+    parts = workbench.parts_of(config)  # what the settings of an attack name, found and loaded
+    problem = workbench.problem_on(parts, differentiated=False)  # renders and judges a configuration
+    journal = workbench.Journal(run, workbench.Shared(problem))  # stores each evaluation, and reads it back
+    query = workbench.Query(u, seed, "trial", 0, spp=16)
+    (evaluation,) = journal.evaluate_all([query])
+
+`advsearch.extend` offers this module to added experiments. Everything here renders or imports torch, so that the
+module of an experiment, which the command line reads for its help, imports it inside functions.
+"""
+
+from __future__ import annotations
+
+from advsearch.attacks import Query as Query
+from advsearch.attacks.verification import LEAST_RATE as LEAST_RATE
+from advsearch.attacks.verification import OVER_CONDITIONS as OVER_CONDITIONS
+from advsearch.engine.image_changes import AWAY as AWAY
+from advsearch.engine.image_changes import as_claimed as as_claimed
+from advsearch.engine.image_changes import changed as changed
+from advsearch.engine.journal import Journal as Journal
+from advsearch.engine.journal import Shared as Shared
+from advsearch.engine.journal import worker_call as worker_call
+from advsearch.engine.record import control_group as control_group
+from advsearch.engine.record import verified_rate as verified_rate
+from advsearch.engine.verifier import RetrialCondition as RetrialCondition
+from advsearch.engine.verifier import Retrials as Retrials
+from advsearch.engine.verifier import kept_configuration as kept_configuration
+from advsearch.engine.verifier import ladder_of as ladder_of
+from advsearch.options import count_outcomes as count_outcomes
+from advsearch.questions.attack.carry_out import LOADING as LOADING
+from advsearch.questions.attack.carry_out import ROLES_IN_SEARCH as ROLES_IN_SEARCH
+from advsearch.questions.attack.carry_out import AttackParts as AttackParts
+from advsearch.questions.attack.carry_out import check_from_config as check_from_config
+from advsearch.questions.attack.carry_out import executor_for as executor_for
+from advsearch.questions.attack.carry_out import parts_in as parts_in
+from advsearch.questions.attack.carry_out import parts_of as parts_of
+from advsearch.questions.attack.carry_out import problem_of_parts as problem_of_parts
+from advsearch.questions.attack.carry_out import problem_on as problem_on
+from advsearch.questions.attack.summary import AttackSummary as AttackSummary
+from advsearch.questions.attack.summary import attack_of as attack_of
