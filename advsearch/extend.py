@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from advsearch.controls.ranges import Fixed as Fixed
     from advsearch.controls.ranges import OneOf as OneOf
     from advsearch.controls.ranges import Range as Range
+    from advsearch.controls.support import images as images
     from advsearch.engine.problem import Problem as Problem
     from advsearch.errors import FileFormatError as FileFormatError
     from advsearch.errors import InputError as InputError
@@ -62,8 +63,10 @@ if TYPE_CHECKING:
     from advsearch.runs.results import RunResult as RunResult
     from advsearch.runs.store import Store as Store
     from advsearch.runs.summary import read_result as read_result
+    from advsearch.scene import assets as assets
     from advsearch.scene import color as color
     from advsearch.scene import geometry as geometry
+    from advsearch.scene import parts as parts
     from advsearch.scene.description import SceneDescription as SceneDescription
     from advsearch.settings import Clash as Clash
     from advsearch.settings import Config as Config
@@ -101,9 +104,12 @@ _NAMES = {
 """The names of the interface, by the module that each is imported from."""
 
 _MODULES = {
+    "assets": "advsearch.scene.assets",
     "color": "advsearch.scene.color",
     "figures": "advsearch.report.figures",
     "geometry": "advsearch.scene.geometry",
+    "images": "advsearch.controls.support.images",
+    "parts": "advsearch.scene.parts",
     "results": "advsearch.runs.results",
     "seeds": "advsearch.seeds",
     "settings": "advsearch.settings",

@@ -109,10 +109,10 @@ FAULTS = (
     ),
     Fault(
         "exporting: degrees for radians",
-        "advsearch/scene/cycles.py",
+        "advsearch/questions/replay/cycles.py",
         '"fov": math.radians(fov),',
         '"fov": fov,',
-        ("tests/scene/test_cycles.py",),
+        ("tests/questions/test_cycles.py",),
     ),
     Fault(
         "controls: the exposure counts twice",

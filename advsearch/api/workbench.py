@@ -14,9 +14,12 @@ module of an experiment, which the command line reads for its help, imports it i
 
 from __future__ import annotations
 
+from advsearch.api.keywords import asks as asks
+from advsearch.api.keywords import configured as configured
 from advsearch.attacks import Query as Query
 from advsearch.attacks.verification import LEAST_RATE as LEAST_RATE
 from advsearch.attacks.verification import OVER_CONDITIONS as OVER_CONDITIONS
+from advsearch.controls import CONTROLS as CONTROLS
 from advsearch.engine.image_changes import AWAY as AWAY
 from advsearch.engine.image_changes import as_claimed as as_claimed
 from advsearch.engine.image_changes import changed as changed
@@ -30,6 +33,8 @@ from advsearch.engine.verifier import Retrials as Retrials
 from advsearch.engine.verifier import kept_configuration as kept_configuration
 from advsearch.engine.verifier import ladder_of as ladder_of
 from advsearch.options import count_outcomes as count_outcomes
+from advsearch.progress import Watched as Watched
+from advsearch.progress import watcher as watcher
 from advsearch.questions.attack.carry_out import LOADING as LOADING
 from advsearch.questions.attack.carry_out import ROLES_IN_SEARCH as ROLES_IN_SEARCH
 from advsearch.questions.attack.carry_out import AttackParts as AttackParts
@@ -39,5 +44,13 @@ from advsearch.questions.attack.carry_out import parts_in as parts_in
 from advsearch.questions.attack.carry_out import parts_of as parts_of
 from advsearch.questions.attack.carry_out import problem_of_parts as problem_of_parts
 from advsearch.questions.attack.carry_out import problem_on as problem_on
+from advsearch.questions.attack.result import AttackResult as AttackResult
 from advsearch.questions.attack.summary import AttackSummary as AttackSummary
 from advsearch.questions.attack.summary import attack_of as attack_of
+from advsearch.scene.assembly import posed as posed
+from advsearch.scene.glb import glb as glb
+from advsearch.scene.grounds import paved as paved
+from advsearch.scene.importing.files import last_line as last_line
+from advsearch.scene.renderer import MAX_SPP as MAX_SPP
+from advsearch.trust.programs import find_blender as find_blender
+from advsearch.trust.programs import surroundings as surroundings

@@ -231,6 +231,18 @@ class Claim(Fields):
     statement: str
     extent: Extent | None = Field(description="null where nothing was counted")
 
+    @classmethod
+    def of_case(cls, name: str, ending: str, rate: VerifiedRate | None, spent: str | None = None) -> Claim:
+        """Return the claim about one adversarial scene of several.
+
+        Args:
+            name: what the scene is called.
+            ending: how its search, or its trials, ended.
+            rate: of its trials.
+            spent: what was searched; None for a scene that was only tried again.
+        """
+        return case_claim(name, ending, rate, spent)
+
 
 NOTHING, NO_PROOF = "Nothing is claimed", "This does not show that there is none."
 ENDED = ("budget spent", "stalled")  # Endings of a search that ran to its end without finding anything

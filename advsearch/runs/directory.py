@@ -213,6 +213,19 @@ class RunDirectory:
         return summary.changed_file(before, values)
 
     @staticmethod
+    def find_file_changed_since(run: Path, config: Config) -> str | None:
+        """Return the name of a file that settings name and that is another one than when a run was made, or None."""
+        with store.Store.open_to_read(run) as results:
+            noted = results.noted(summary.MADE_WITH)
+        before = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
+        return summary.changed_file(before, config.plain())
+
+    @staticmethod
+    def read_python_only(run: str | Path) -> list[PythonOnly]:
+        """Return the parts of a run that existed only in the Python session that made it."""
+        return read_python_only(Path(run))
+
+    @staticmethod
     def locate_part(run: Path, name: str) -> Path:
         """Return the folder of a part of a run, whether it exists or not."""
         return run / PARTS / name

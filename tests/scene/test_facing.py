@@ -17,8 +17,8 @@ from advsearch.cli.main import _join_negative_axis
 from advsearch.controls.camera import CameraControl
 from advsearch.engine.loading import load_scene, scene_as_settings
 from advsearch.errors import InputError
+from advsearch.questions.replay.cycles import _turn_for_blender
 from advsearch.scene import library
-from advsearch.scene.cycles import _turn_for_blender
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import glb

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from advsearch.experiment import PositionalArgument, RunContext, experiment
+from typing import Any
+
+from advsearch.extend import PositionalArgument, RunContext, experiment
 from advsearch.questions.replay.result import ReplayConfig, ReplayResult, claims, shown
 
 
@@ -15,8 +17,8 @@ from advsearch.questions.replay.result import ReplayConfig, ReplayResult, claims
     view=shown,
     claims=claims,
 )
-def replay(asked: RunContext[ReplayConfig]) -> ReplayResult:
+def replay(asked: RunContext[ReplayConfig], parts: Any = None) -> ReplayResult:
     """Render the adversarial scene of a run under other conditions, each beside the clean scene."""
     from advsearch.questions.replay.conditions import rendered_again  # imports torch
 
-    return rendered_again(asked)
+    return rendered_again(asked, parts)

@@ -12,27 +12,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch import seeds
-from advsearch.api.keywords import asks, configured
-from advsearch.controls.sensor import SensorControl, through_sensor
-from advsearch.controls.support.images import coded
-from advsearch.engine.naming import different
-from advsearch.engine.problem import Problem
-from advsearch.engine.record import control_group, verified_rate
-from advsearch.engine.verifier import RetrialCondition, Retrials, kept_configuration
-from advsearch.errors import InputError
-from advsearch.experiment import RunContext, run_and_save
-from advsearch.progress import Progress, Watched, watcher
-from advsearch.questions.attack.carry_out import LOADING, ROLES_IN_SEARCH, AttackParts, parts_in, problem_of_parts
-from advsearch.questions.attack.result import AttackResult
-from advsearch.questions.attack.summary import attack_of
+from advsearch.extend import (
+    InputError,
+    Problem,
+    Progress,
+    RunContext,
+    RunDirectory,
+    find_run,
+    images,
+    seeds,
+    settings,
+    workbench,
+)
+from advsearch.questions.replay.cycles import BlenderError, Cycles
 from advsearch.questions.replay.result import NOT_DONE, ReplayConfig, ReplayResult, ReplayRow
-from advsearch.runs.directory import RunDirectory, find_run, read_python_only
-from advsearch.runs.store import NAME, Store
-from advsearch.runs.summary import MADE_WITH, changed_file
-from advsearch.scene.cycles import BlenderError, Cycles
-from advsearch.scene.renderer import MAX_SPP, Renderer
-from advsearch.settings import PythonOnly
 
 OWN = "as verified"  # The way in which nothing is changed
 OWN_LIGHT = "own"  # What conditions share whose pictures come of the radiance that the run itself would render
@@ -66,9 +59,10 @@ class Way:
     change: Callable[[Tensor, int], Tensor] | None = None
     missing: str = ""
 
-    def condition(self) -> RetrialCondition:
+    def condition(self) -> workbench.RetrialCondition:
         title = self.text if self.name == OWN else f"{self.name}: {self.text}"
-        return RetrialCondition(title, self.problem(), self.spp, self.source or title, self.change, self.light)
+        source = self.source or title
+        return workbench.RetrialCondition(title, self.problem(), self.spp, source, self.change, self.light)
 
 
 def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Problem]) -> Iterator[Way]:
@@ -88,7 +82,7 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
         return Way(name, text, lambda: replace(problem, renderer=renderer.like(**fields)), spp, light)
 
     yield same(OWN, OWN)
-    for count in (max(1, spp // 4), min(MAX_SPP, 4 * spp)):
+    for count in (max(1, spp // 4), min(workbench.MAX_SPP, 4 * spp)):
         if count != spp:
             yield same("samples", f"{count} a pixel", count)
     height, width = formation.resolution
@@ -109,8 +103,7 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
     for quality in QUALITIES:
         yield same("jpeg", f"quality {quality}", change=partial(_file, quality))
     for name, values in SENSORS.items():
-        full = {one.name: torch.tensor(values.get(one.name, 0.0)) for one in SensorControl.parameters}
-        yield same("sensor", name, change=partial(_sensed, full))
+        yield same("sensor", name, change=partial(_sensed, values))
 
     def by_blender() -> Problem:
         return replace(problem, renderer=renderer.like(source=cycles.radiance))
@@ -124,51 +117,60 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
 
 
 def _file(quality: int, picture: Tensor, _seed: int) -> Tensor:
-    return coded(picture, quality).clamp(0.0, 1.0)
+    return images.coded(picture, quality).clamp(0.0, 1.0)
 
 
-def _sensed(values: Mapping[str, Tensor], picture: Tensor, seed: int) -> Tensor:
-    return through_sensor(picture, values, seed)
+def _sensed(values: Mapping[str, float], picture: Tensor, seed: int) -> Tensor:
+    control = workbench.CONTROLS["sensor"]()
+    control.chosen["seed"] = seed
+    of_control = {parameter.name: values.get(parameter.name, 0.0) for parameter in control.parameters}
+    changed: Tensor = control.on_picture({name: torch.tensor(value) for name, value in of_control.items()}, picture)
+    return changed
 
 
-@asks(ReplayConfig)
-def replay(attack: str | Path | AttackResult, *, progress: Watched = None, **settings: Any) -> ReplayResult:
+@workbench.asks(ReplayConfig)
+def replay(
+    attack: str | Path | workbench.AttackResult, *, progress: workbench.Watched = None, **options: Any
+) -> ReplayResult:
     """Render the adversarial scene of a run under other conditions, each beside the clean scene (docs/questions.md).
 
     Args:
         attack: one that was kept and has ended: its result, or name or folder of its run.
     """
-    parts, only_now = None, list[PythonOnly]()
-    if isinstance(attack, AttackResult):
+    from advsearch.questions.replay import replay as experiment  # which names this function
+
+    parts, only_now, run = None, list[settings.PythonOnly](), attack
+    if isinstance(attack, workbench.AttackResult):
         if attack.run is None:
             raise InputError("attack: expected an attack that was kept, got one that was not; give it a `run`")
-        only_now = [part for part in read_python_only(attack.run) if part.role not in ROLES_IN_SEARCH]
+        run = attack.run
+        only_now = [part for part in RunDirectory.read_python_only(run) if part.role not in workbench.ROLES_IN_SEARCH]
         parts = None if attack.parts is None else attack.parts()
-    config = configured(ReplayConfig, attack=attack.run if isinstance(attack, AttackResult) else attack, **settings)
-    asked = RunContext(config.with_only_here(only_now) if only_now else config, watcher(progress))
-    return run_and_save(partial(rendered_again, parts=parts), asked)
+    config = workbench.configured(ReplayConfig, attack=run, **options)
+    config = config.with_only_here(only_now) if only_now else config
+    return experiment.run(config, progress=workbench.watcher(progress), parts=parts)
 
 
-def rendered_again(asked: RunContext[ReplayConfig], parts: AttackParts | None = None) -> ReplayResult:
+def rendered_again(asked: RunContext[ReplayConfig], parts: workbench.AttackParts | None = None) -> ReplayResult:
     """Render an adversarial scene again as a configuration describes; every trial is stored at once, and a run goes on
     with the next. `parts` is what the attack was asked with; None loads what its run names. Raises InputError where the
     run has no adversarial configuration, or its scene is another one now, and FileFormatError where it did not end, or
     is of another command."""
     config = asked.config
-    asked.progress.stage(LOADING)
+    asked.progress.stage(workbench.LOADING)
     folder = find_run(config.attack)
-    summary = attack_of(folder)
+    summary = workbench.attack_of(folder)
     if summary.adversarial is None:
         raise InputError(
             f"{folder}: ended with {summary.ending!r}, so that there is no adversarial configuration to render again"
         )
-    different((OWN_MODEL, *config.models), "model")
-    parts = parts or parts_in(folder)
+    settings.check_once((OWN_MODEL, *config.models), "model")
+    parts = parts or workbench.parts_in(folder)
     threads = {} if config.threads is None else {"threads": config.threads}
-    again = partial(problem_of_parts, parts, **threads)
+    again = partial(workbench.problem_of_parts, parts, **threads)
     problem, warnings = again()
     warnings += _changed(folder, parts)
-    u = kept_configuration(folder, problem)
+    u = workbench.kept_configuration(folder, problem)
     spp = summary.sample_count.spp if summary.sample_count else summary.verified.spp if summary.verified else 64
     own, *others = ways_of(problem, spp, lambda size: again(resolution=size)[0])
     ways = [own, *(way for way in others if way.name in config.chosen)]
@@ -213,7 +215,7 @@ class _Table:
     def fill(self, ways: Sequence[Way]) -> None:
         """Add the rows of some conditions that share their renders: the clean scene under all of them, then the
         adversarial one. A condition that cannot be had, or that Blender fails at, gets a row that says why."""
-        renderers, before = list[Renderer](), 0
+        renderers, before = list[Any](), 0
         try:
             if missing := next((way.missing for way in ways if way.missing), ""):
                 raise BlenderError(missing)
@@ -223,11 +225,13 @@ class _Table:
             conditions = {way: way.condition() for way in ways}
             renderers += {id(one.problem.renderer): one.problem.renderer for one in conditions.values()}.values()
             before = sum(renderer.renders for renderer in renderers)
-            retrials = Retrials([*conditions.values()], self.run, self.progress, trials=self.trials, seed=self.seed)
-            clean = {way: control_group(retrials.clean(one), one.spp) for way, one in conditions.items()}
+            retrials = workbench.Retrials(
+                [*conditions.values()], self.run, self.progress, trials=self.trials, seed=self.seed
+            )
+            clean = {way: workbench.control_group(retrials.clean(one), one.spp) for way, one in conditions.items()}
             for way, condition in conditions.items():
                 checked = retrials.adversarial("answer", self.u, condition)
-                ending, rate = checked.ending.value, verified_rate(checked)
+                ending, rate = checked.ending.value, workbench.verified_rate(checked)
                 self.rows[way] = ReplayRow(
                     way=way.name, condition=way.text, ending=ending, clean=clean[way], verified=rate
                 )
@@ -238,10 +242,7 @@ class _Table:
             self.renders += sum(renderer.renders for renderer in renderers) - before
 
 
-def _changed(folder: Path, parts: AttackParts) -> list[str]:
+def _changed(folder: Path, parts: workbench.AttackParts) -> list[str]:
     """A caution where a file was another one when the run was made."""
-    with Store(folder / NAME, read_only=True) as results:
-        noted = results.noted(MADE_WITH)
-    before = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
-    name = changed_file(before, parts.config.plain())
+    name = RunDirectory.find_file_changed_since(folder, parts.config)
     return [f"{name} is not what it was when the run was made: what does not hold may come from that."] if name else []

@@ -8,12 +8,22 @@ from typing import ClassVar
 
 from pydantic import Field, field_validator
 
-from advsearch.config import SceneConfig
-from advsearch.questions.attack.settings import FEWEST_TRIALS
-from advsearch.report import wording
-from advsearch.report.shown import Claim, InNotebook, ResultPart, ShownResult, case_claim
-from advsearch.runs.results import ControlGroup, Fields, SceneResult, VerifiedRate
-from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
+from advsearch.extend import (
+    AttackConfig,
+    Claim,
+    Clash,
+    Config,
+    Fields,
+    InNotebook,
+    ResultPart,
+    SceneConfig,
+    ShownResult,
+    results,
+    setting,
+    setting_as_in,
+    settings,
+    wording,
+)
 
 WAYS = ("samples", "resolution", "depth", "integrator", "sampler", "denoiser", "curve", "jpeg", "sensor", "blender")
 """What a replay may change beside the model."""
@@ -38,30 +48,31 @@ class ReplayConfig(Config):
         None, "replay", "other models that the scene is tried on, separated by commas", "models as `attack` takes them",
         otherwise="none",
     )  # fmt: skip
-    trials: int = setting(
-        REPLAY_TRIALS, "replay", "fresh renders under each condition", unit="renders", ge=FEWEST_TRIALS, le=100_000
-    )
+    trials: int = setting_as_in(
+        AttackConfig, "trials", default=REPLAY_TRIALS, group="replay", description="fresh renders under each condition",
+        expects="", otherwise="",
+    )  # fmt: skip
     threads: int | None = setting_as_in(SceneConfig, "threads")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-replay-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    _named = texts("attack", "run", several=["ways", "model"])
-    _different = each_once("ways")
+    _named = settings.texts("attack", "run", several=["ways", "model"])
+    _different = settings.each_once("ways")
 
     @field_validator("ways")
     @classmethod
     def _known_ways(cls, value: str | None) -> str | None:
-        if value is not None and set(split_names(value)) - set(WAYS):
+        if value is not None and set(settings.split_names(value)) - set(WAYS):
             raise ValueError("an unknown way")
         return value
 
     @property
     def chosen(self) -> tuple[str, ...]:
-        return WAYS if self.ways is None else split_names(self.ways)
+        return WAYS if self.ways is None else settings.split_names(self.ways)
 
     @property
     def models(self) -> tuple[str, ...]:
-        return () if self.model is None else split_names(self.model)
+        return () if self.model is None else settings.split_names(self.model)
 
     @property
     def title(self) -> tuple[str, ...]:
@@ -79,16 +90,16 @@ class ReplayRow(Fields):
     ending: str = Field(
         description="`found` where the adversarial scene holds under it, as for an attack; or `not done`"
     )
-    clean: ControlGroup | None = Field(
+    clean: results.ControlGroup | None = Field(
         None, description="trials of the clean scene under it, and in how many it is right; absent if not done"
     )
-    verified: VerifiedRate | None = Field(
+    verified: results.VerifiedRate | None = Field(
         None, description="trials of the adversarial scene, beside these; absent if not done"
     )
     reason: str = Field("", description="why it was not done, and what to do; absent if it was")
 
 
-class ReplayResult(InNotebook, SceneResult):
+class ReplayResult(InNotebook, results.SceneResult):
     """The adversarial scene of a run under other conditions than it was searched and verified under."""
 
     command: ClassVar[str] = "replay"
@@ -130,7 +141,7 @@ def claims(result: ReplayResult) -> Iterator[Claim]:
     for row in result.table:
         name = f"the adversarial scene of {PurePath(result.answer).name}, {row.way}"
         name += "" if row.way == row.condition else f": {row.condition}"
-        yield case_claim(name, row.ending, row.verified, None)
+        yield Claim.of_case(name, row.ending, row.verified)
 
 
 def replay_text(result: ReplayResult) -> str:

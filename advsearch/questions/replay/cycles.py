@@ -21,21 +21,10 @@ import OpenEXR
 import torch
 from torch import Tensor
 
-from advsearch.errors import AdvsearchError, FileFormatError
-from advsearch.scene.assembly import posed
-from advsearch.scene.assets import Material, Mesh, Shape, pose_of
-from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.glb import glb
-from advsearch.scene.grounds import paved
-from advsearch.scene.importing.blender import command, last_line
-from advsearch.scene.parts import BallLamp, MeshPart, PointLamp
-from advsearch.trust.programs import surroundings
-from advsearch.trust.stored_files import scaled
+from advsearch.extend import FileFormatError, SceneDescription, assets, color, geometry, parts, stored_files, workbench
 
 LONGEST = 300  # seconds that one picture may take, the start included, before `scaled`
-MATT = Material(roughness=1.0, metallic=0.0, specular=0.0)  # of the ground
+MATT = assets.Material(roughness=1.0, metallic=0.0, specular=0.0)  # of the ground
 PAUSE = 0.02  # seconds between looks at whether a picture is there
 
 RENDER = """
@@ -121,7 +110,7 @@ for line in sys.stdin:
 """
 
 
-class BlenderError(AdvsearchError):
+class BlenderError(Exception):
     """Blender is not there, cannot show a scene, or stopped."""
 
 
@@ -132,10 +121,11 @@ class Cycles:
 
     def __init__(self, description: SceneDescription, size: tuple[int, int], *, max_depth: int, denoise: bool) -> None:
         try:
-            self._command = command("Blender's Cycles has to render it", "leave `ways=blender` out")
+            self._command = workbench.find_blender("Blender's Cycles has to render it", "leave `ways=blender` out")
         except FileFormatError as error:
             raise BlenderError(str(error)) from None
-        unknown = [part.name for part in description.parts if not isinstance(part, (MeshPart, PointLamp, BallLamp))]
+        known = (parts.MeshPart, parts.PointLamp, parts.BallLamp)
+        unknown = [part.name for part in description.parts if not isinstance(part, known)]
         own = [name for name, mesh in description.meshes.items() if mesh.surface]
         unknown += [f"a surface of Mitsuba's own on the {name}" for name in own]
         unknown += ["a lens"] if description.thin_lens or description.camera_model else []
@@ -161,21 +151,21 @@ class Cycles:
     def _told(self, inputs: Mapping[str, Tensor]) -> tuple[dict[str, object], bytes, np.ndarray | None]:
         scene, (height, width) = self._description, self._resolution
         values = {name: value.detach().cpu() for name, value in inputs.items()}
-        meshes = [posed(part, values) for part in scene.meshes.values()]
+        meshes = [workbench.posed(part, values) for part in scene.meshes.values()]
         meshes += _ground(scene, values.get("ground.reflectance"))
-        pose = values.get("camera.to_world", torch.from_numpy(camera_to_world(scene, width / height)))
+        pose = values.get("camera.to_world", torch.from_numpy(geometry.camera_to_world(scene, width / height)))
         camera = pose.double().numpy()
         fov = float(values.get("camera.fov", torch.tensor([scene.number("camera.fov")]))[0])
         shift = [float(values.get(f"camera.shift_{axis}", torch.zeros(1))[0]) for axis in "xy"]
         lamps: list[dict[str, object]] = []
         for lamp in scene.lamps.values():
             place, shape = np.eye(4), list[list[float]]()
-            if isinstance(lamp, BallLamp):
-                ball = pose_of(lamp.radius * np.eye(3), lamp.place)
+            if isinstance(lamp, parts.BallLamp):
+                ball = assets.pose_of(lamp.radius * np.eye(3), lamp.place)
                 shape = values.get(f"{lamp.name}.ball", torch.from_numpy(ball)).double().tolist()
                 color = values.get(f"{lamp.name}.radiance", torch.tensor(lamp.radiance))
             else:
-                assert isinstance(lamp, PointLamp)  # others are refused before
+                assert isinstance(lamp, parts.PointLamp)  # others are refused before
                 place[:3, 3] = values.get(f"{lamp.name}.position", torch.tensor(lamp.position)).numpy()
                 color = values.get(f"{lamp.name}.intensity", torch.tensor(lamp.intensity))
             if bool((color > 0.0).any()):
@@ -196,10 +186,10 @@ class Cycles:
             "bounces": max(0, self._depth - 2),
             "denoise": self._denoise,
         }
-        return message, glb([_turn_for_blender(mesh) for mesh in meshes]), radiance
+        return message, workbench.glb([_turn_for_blender(mesh) for mesh in meshes]), radiance
 
 
-def _turn_for_blender(shape: Shape) -> Shape:
+def _turn_for_blender(shape: assets.Shape) -> assets.Shape:
     """Return a mesh turned so that Blender, for which the front of a glTF file is -y, has our axes."""
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32)
     mesh = shape.mesh
@@ -207,18 +197,18 @@ def _turn_for_blender(shape: Shape) -> Shape:
     return replace(shape, mesh=turned)
 
 
-def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[Shape]:
+def _ground(scene: SceneDescription, reflectance: Tensor | None) -> list[assets.Shape]:
     photograph = scene.photograph
     if photograph is not None:
         shown = photograph.base if reflectance is None else reflectance
-        return [Shape("ground", photograph.mesh, linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(), MATT)]
+        return [assets.Shape("ground", photograph.mesh, color.linear_to_srgb(shown.clamp(0.0, 1.0)).numpy(), MATT)]
     half = np.float32(scene.number("ground.size") / 2.0)
-    if half <= 0.0 or paved(scene):
+    if half <= 0.0 or workbench.paved(scene):
         return []
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     faces, up = np.array([[0, 1, 2], [0, 2, 3]], np.uint32), np.tile(np.array([[0, 0, 1]], np.float32), (4, 1))
-    mesh = Mesh(corners * half, faces, up, corners[:, :2] * np.float32(0.5) + np.float32(0.5))
-    return [Shape("ground", mesh, np.full((1, 1, 3), scene.ground_color, np.float32), MATT)]
+    mesh = assets.Mesh(corners * half, faces, up, corners[:, :2] * np.float32(0.5) + np.float32(0.5))
+    return [assets.Shape("ground", mesh, np.full((1, 1, 3), scene.ground_color, np.float32), MATT)]
 
 
 class _Process:
@@ -240,7 +230,7 @@ class _Process:
                 self._process = subprocess.Popen(
                     [*program, str(self._folder / "render.py"), *between, str(self._folder)],
                     cwd=self._folder,
-                    env=surroundings(str(self._folder)),
+                    env=workbench.surroundings(str(self._folder)),
                     stdin=subprocess.PIPE,
                     stdout=said,
                     stderr=said,
@@ -252,7 +242,7 @@ class _Process:
     def picture(self, seed: int, spp: int) -> Tensor:
         """One picture with its own noise, (H, W, 3)."""
         self._count += 1
-        path, until = self._folder / f"{self._count}.exr", time.monotonic() + scaled(LONGEST)
+        path, until = self._folder / f"{self._count}.exr", time.monotonic() + stored_files.scaled(LONGEST)
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(f"{seed} {spp} {self._count}\n".encode())
@@ -261,10 +251,10 @@ class _Process:
             pass  # it has stopped, which is words below
         while not path.is_file():
             if self._process.poll() is not None and not path.is_file():
-                words = last_line(self._said.read_text("utf-8", "replace"))
+                words = workbench.last_line(self._said.read_text("utf-8", "replace"))
                 raise BlenderError(f"Blender stopped{words}")
             if time.monotonic() > until:
-                raise BlenderError(f"Blender had not rendered it after {scaled(LONGEST)} seconds")
+                raise BlenderError(f"Blender had not rendered it after {stored_files.scaled(LONGEST)} seconds")
             time.sleep(PAUSE)
         with OpenEXR.File(str(path)) as picture:
             pixels = next(iter(picture.channels().values())).pixels
