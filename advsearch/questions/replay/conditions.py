@@ -27,6 +27,9 @@ from advsearch.extend import (
 from advsearch.questions.replay.cycles import BlenderError, Cycles
 from advsearch.questions.replay.result import NOT_DONE, ReplayConfig, ReplayResult, ReplayRow
 
+AttackResult = workbench.AttackResult
+Watched = workbench.Watched
+
 OWN = "as verified"  # The way in which nothing is changed
 OWN_LIGHT = "own"  # What conditions share whose pictures come of the radiance that the run itself would render
 QUALITIES = (90, 75, 50)
@@ -129,9 +132,7 @@ def _sensed(values: Mapping[str, float], picture: Tensor, seed: int) -> Tensor:
 
 
 @workbench.asks(ReplayConfig)
-def replay(
-    attack: str | Path | workbench.AttackResult, *, progress: workbench.Watched = None, **options: Any
-) -> ReplayResult:
+def replay(attack: str | Path | AttackResult, *, progress: Watched = None, **options: Any) -> ReplayResult:
     """Render the adversarial scene of a run under other conditions, each beside the clean scene (docs/questions.md).
 
     Args:
@@ -140,7 +141,7 @@ def replay(
     from advsearch.questions.replay import replay as experiment  # which names this function
 
     parts, only_now, run = None, list[settings.PythonOnly](), attack
-    if isinstance(attack, workbench.AttackResult):
+    if isinstance(attack, AttackResult):
         if attack.run is None:
             raise InputError("attack: expected an attack that was kept, got one that was not; give it a `run`")
         run = attack.run
