@@ -15,6 +15,7 @@ from samples import sweep
 
 from advsearch.files import JsonValue
 from advsearch.options import Value
+from advsearch.questions.photographs.pages import PhotographPages
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.rules import observed
@@ -83,7 +84,8 @@ def serving(
     *runs: Path, host: str = "127.0.0.1", https: bool = False, photographs: object | None = None
 ) -> Iterator[Dashboard]:
     """A server of these runs, for as long as the block."""
-    server = Dashboard(runs, host, 0, https=https, photographs=photographs)
+    pages = None if photographs is None else PhotographPages(photographs)
+    server = Dashboard(runs, host, 0, https=https, photographs=pages)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
     thread.start()
     try:

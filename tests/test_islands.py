@@ -22,6 +22,15 @@ CORE = {
 }
 """The built-in parts that are no islands, by kind."""
 
+OTHER_ISLANDS = {
+    "advsearch.questions.photographs": "photographs of runs",
+    "advsearch.questions.report": "command report",
+}
+"""Islands that no table of parts has, with what they are: they are found by a name that `advsearch.registry` imports."""
+
+ELSEWHERE = {"advsearch.cli.report": "advsearch.questions.report"}
+"""Modules that belong to an island, but stand in the folder of their kind."""
+
 NOT_YET: frozenset[str] = frozenset(
     {
         "advsearch/attacks/policies/archive.py",
@@ -112,7 +121,7 @@ CORE_NOT_YET: frozenset[str] = frozenset(
 
 def island_of_module() -> dict[str, str]:
     """Return the module or package of each island, with the names of its parts."""
-    islands: dict[str, str] = {}
+    islands = dict(OTHER_ISLANDS)
     for part in BUILT_INS:
         if part.name not in CORE[part.kind]:
             module = part.target.partition(":")[0]
@@ -123,6 +132,7 @@ def island_of_module() -> dict[str, str]:
 def find_island(module: str) -> str | None:
     """Return the island that a module belongs to: its own, or that of a package that it is in."""
     islands = island_of_module()
+    module = ELSEWHERE.get(module, module)
     while module:
         if module in islands:
             return module

@@ -14,6 +14,8 @@ module of an experiment, which the command line reads for its help, imports it i
 
 from __future__ import annotations
 
+from typing import Any
+
 from advsearch.api.keywords import asks as asks
 from advsearch.api.keywords import configured as configured
 from advsearch.attacks import Query as Query
@@ -47,6 +49,8 @@ from advsearch.questions.attack.carry_out import problem_on as problem_on
 from advsearch.questions.attack.result import AttackResult as AttackResult
 from advsearch.questions.attack.summary import AttackSummary as AttackSummary
 from advsearch.questions.attack.summary import attack_of as attack_of
+from advsearch.registry import get_experiment as get_experiment
+from advsearch.registry import imported
 from advsearch.scene.assembly import posed as posed
 from advsearch.scene.glb import glb as glb
 from advsearch.scene.grounds import paved as paved
@@ -54,3 +58,11 @@ from advsearch.scene.importing.files import last_line as last_line
 from advsearch.scene.renderer import MAX_SPP as MAX_SPP
 from advsearch.trust.programs import find_blender as find_blender
 from advsearch.trust.programs import surroundings as surroundings
+
+
+def load_photographs() -> Any:
+    """Return what takes photographs of the real thing in for runs, and counts how they agree with the renderings.
+
+    It has `list_files(folder, task)`, `add_files(run, files)` and `agreement(run)` (`advsearch.photo_agreement`).
+    """
+    return imported("advsearch.questions.photographs.carry_out:Photographs")()

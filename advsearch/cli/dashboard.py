@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import argparse
 import sys
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from advsearch.catalog import is_present
 from advsearch.cli import output
 from advsearch.cli.main import argument, command
 from advsearch.errors import InputError
 from advsearch.questions.sweep.page import write_bundle
+from advsearch.registry import imported
 from advsearch.runs.directory import find_run
 from advsearch.viewer.clients import NO_QR, qr_text
 from advsearch.viewer.pages import write_page
 from advsearch.viewer.server import Dashboard
 
-if TYPE_CHECKING:
-    from advsearch.questions.photographs.carry_out import Photographs
-    from advsearch.questions.photographs.result import PhotoAgreement
-
 PORT = 8265
+PHOTOGRAPH_PAGES = "advsearch.questions.photographs.pages:PhotographPages"
 
 SEEN = (
     "Whoever has this address sees the runs and can send photographs. Each is judged on this machine, by the model "
@@ -50,7 +47,9 @@ def dashboard(args: argparse.Namespace) -> int:
     if not 0 <= args.port <= 65535:
         raise InputError(f"--port: expected a number from 0 to 65535, got {args.port}")
     runs = [find_run(name, checked=False) for name in args.runs]  # the list says what is wrong with one
-    server = Dashboard(runs, args.host, args.port, https=args.https, photographs=_LoadedLater())
+    has_photographs = is_present(PHOTOGRAPH_PAGES.partition(":")[0])
+    photographs = imported(PHOTOGRAPH_PAGES)() if has_photographs else None
+    server = Dashboard(runs, args.host, args.port, https=args.https, photographs=photographs)
     facts = {"address": server.address, "token": server.token, "fingerprint": server.fingerprint}
     output.say(args.json, {"command": "dashboard", **facts}, server.address)
     sys.stdout.flush()
@@ -69,22 +68,6 @@ def dashboard(args: argparse.Namespace) -> int:
     finally:
         server.server_close()
     return 0
-
-
-class _LoadedLater:
-    """`Photographs`, which needs PyTorch: loaded when a page of photographs is first opened."""
-
-    @cached_property
-    def _loaded(self) -> Photographs:
-        from advsearch.questions.photographs.carry_out import Photographs  # takes seconds
-
-        return Photographs()
-
-    def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
-        return self._loaded.add(run, rendering, data)
-
-    def agreement(self, run: Path) -> PhotoAgreement:
-        return self._loaded.agreement(run)
 
 
 @command(

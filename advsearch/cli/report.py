@@ -83,7 +83,7 @@ def report(args: argparse.Namespace) -> int:
 
 def _take_in(folder: str, name: str) -> None:
     """Have a run's model judge the photographs in a folder that the run does not have yet."""
-    from advsearch.questions.photographs.carry_out import Photographs, photographs_in  # they bring torch
+    from advsearch.extend import workbench  # it brings torch
     from advsearch.runs.directory import CONFIG, find_run
     from advsearch.settings import read_yaml
 
@@ -93,7 +93,8 @@ def _take_in(folder: str, name: str) -> None:
         place = Path(folder)
         if (place / POSES).is_file():
             place = _named_by_pose(place, run, Path(named))
-        files = photographs_in(place, task)
+        photographs = workbench.load_photographs()
+        files = photographs.list_files(place, task)
         if loose := [file.name for file in files if not file.stem.startswith("rendering-")]:
             raise InputError(
                 f"photographs: {loose[0]}: expected the number of a rendering in its name, such as rendering-12.jpg, "
@@ -101,7 +102,7 @@ def _take_in(folder: str, name: str) -> None:
             )
         if not files:
             raise InputError(f"photographs: {folder}: expected a folder with photographs, got none in it")
-        Photographs().add_files(run, files)
+        photographs.add_files(run, files)
 
 
 def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:

@@ -22,7 +22,7 @@ from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
 from advsearch.registry import Registry, get_first_doc_line, imported
 from advsearch.report.wording import count, interval_text
-from advsearch.runs.directory import IMAGES, find_run
+from advsearch.runs.directory import IMAGES, PHOTOGRAPHS, find_run
 from advsearch.runs.listing import Listed, listed_run
 from advsearch.runs.results import plain
 from advsearch.runs.summary import NAME, read_result
@@ -30,7 +30,6 @@ from advsearch.trust.code import allow_named
 
 if TYPE_CHECKING:
     from advsearch.controls import Choice, Parameter
-    from advsearch.questions.photographs.result import PhotoAgreement
 
 
 def _set_usage(parser: argparse.ArgumentParser) -> None:
@@ -97,13 +96,11 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     return 0
 
 
-def photos_of(run: Path) -> PhotoAgreement | None:
-    """Return how photographs agree with the run's renderings; None where there are none."""
-    from advsearch.questions.photographs.result import FOLDER  # works without that room
-
-    if not (run / IMAGES / FOLDER).is_dir():
+def photos_of(run: Path) -> Any:
+    """Return how photographs agree with the run's renderings (`advsearch.photo_agreement`); None where it has none."""
+    if not (run / PHOTOGRAPHS).is_dir():
         return None
-    from advsearch.questions.photographs.carry_out import photo_agreement  # takes seconds
+    from advsearch import photo_agreement  # takes seconds
 
     return photo_agreement(run)
 

@@ -41,6 +41,7 @@ REPORT = "report.html"
 COLUMNS = "columns.bin"  # of a sweep that has ended: its rows as columns of numbers (advsearch/viewer/columns.py)
 IMAGES = "images"
 SMALL_PICTURES = f"{IMAGES}/rows"  # of a sweep, in folders of a thousand
+PHOTOGRAPHS = f"{IMAGES}/photos"  # of the real thing, aligned with renderings
 ARTIFACTS = "artifacts"
 OBJECT_FILE = f"{ARTIFACTS}/object.glb"  # what was attacked, before and after, to turn in a browser
 AOV_FOLDER = "aov"  # of a sweep: the ground truth of each picture, by its number

@@ -19,16 +19,16 @@ import secrets
 import ssl
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from email.message import Message
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from advsearch.errors import AdvsearchError, InputError
-from advsearch.questions.photographs import result as photos
 from advsearch.questions.sweep.page import SweepSource, result_of, sweep_page_html
 from advsearch.report import wording
 from advsearch.report.shown import Html, element, join_html
@@ -154,6 +154,22 @@ BACKLOG = 4096  # connections that may wait in the operating system
 NUMBERED = re.compile(r"[0-9]+/[0-9]{1,12}\.jpg")  # a thousand pictures have a folder
 
 
+class PhotographServer(Protocol):
+    """What answers for the page of a run on which photographs are aligned with its renderings."""
+
+    def make_page(self, run: Path, name: str, key: str, elsewhere: str | None) -> str:
+        """Return the page as HTML; `elsewhere` is its address for another device, if one can open it."""
+
+    def read_picture(self, kind: str, run: Path, name: str) -> tuple[str, bytes]:
+        """Return the type and the data of a "rendering" or of a "photo" of a run. Raises Refused: there is none."""
+
+    def take(
+        self, run: Path, name: str, headers: Message, key: str, read_data: Callable[[], bytes]
+    ) -> tuple[str, bytes]:
+        """Take a photograph in, and return the type and the data of the answer. Raises Refused: it is none, or it
+        doesn't come from the page, which alone has the key."""
+
+
 class Dashboard(HTTPServer):
     """The server, of folders of runs, or of those in ``runs/``, looked up anew for each request; `serve_forever`
     answers until `shutdown`. A `port` of 0 takes a free one; beyond this machine it always speaks HTTPS; without what
@@ -171,7 +187,7 @@ class Dashboard(HTTPServer):
         port: int = 0,
         *,
         https: bool = False,
-        photographs: object | None = None,
+        photographs: PhotographServer | None = None,
     ) -> None:
         self._given: dict[str, Path] = {}
         for path in runs:
@@ -222,6 +238,13 @@ class Dashboard(HTTPServer):
             raise Refused(HTTPStatus.NOT_FOUND, "there is no such run")
         check_links(path)
         return path
+
+    @property
+    def photograph_pages(self) -> PhotographServer:
+        """What answers about photographs. Raises Refused: this server takes none."""
+        if self.photographs is None:
+            raise Refused(HTTPStatus.NOT_FOUND, "this server takes no photographs; advsearch dashboard does")
+        return self.photographs
 
     def key(self, name: str) -> str:
         """What a photograph of a run has to bring: its page has it, and no other."""
@@ -322,7 +345,7 @@ class _Handler(BaseHTTPRequestHandler):
             match parts:
                 case ["runs", name, "align", "renderings", file]:
                     run, key = server.run(name), server.key(name)
-                    return Served(*photos.take(server.photographs, run, file, self.headers, key, self._body))
+                    return Served(*server.photograph_pages.take(run, file, self.headers, key, self._body))
             raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
         match parts:
             case [""]:
@@ -350,10 +373,10 @@ class _Handler(BaseHTTPRequestHandler):
             case ["runs", name, "align", ""]:
                 run, key = server.run(name), server.key(name)
                 elsewhere = server.address_of(f"/runs/{in_address(name)}/align/") if server.token else None
-                page = photos.photographs_html(server.photographs, run, name, key, elsewhere)
+                page = server.photograph_pages.make_page(run, name, key, elsewhere)
                 return _own(page, "../../../", ("../", name))
             case ["runs", name, "align", ("renderings" | "photos") as kind, file]:
-                return Served(*photos.picture(kind.removesuffix("s"), server.run(name), file))
+                return Served(*server.photograph_pages.read_picture(kind.removesuffix("s"), server.run(name), file))
         raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
 
     def _compare(self, query: Query) -> Served:

@@ -19,7 +19,6 @@ from stored_sweeps import make_sweep
 
 import advsearch
 from advsearch import testing
-from advsearch.cli.dashboard import _LoadedLater as TakenLater
 from advsearch.cli.main import list_commands, main
 from advsearch.cluster import WorkerTask
 from advsearch.cluster.worker import run_batch
@@ -28,6 +27,7 @@ from advsearch.questions.attack.carry_out import parts_in
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import attacks_of
 from advsearch.questions.photographs.carry_out import Photographs
+from advsearch.questions.photographs.pages import PhotographPages
 from advsearch.runs.directory import RunDirectory
 from advsearch.settings import HEADER
 from advsearch.trust.code import allow_named, allowed_code, nothing_allowed
@@ -215,7 +215,7 @@ def test_a_function_imports_what_its_caller_names_alone(name: str) -> None:
 
 def test_the_dashboard_imports_nothing_for_a_photograph() -> None:
     with pytest.raises(InputError, match=NAME):
-        TakenLater().add(Path("runs/kept"), "0", photograph())
+        PhotographPages()._photographs.add(Path("runs/kept"), "0", photograph())
     assert not Path("imported").exists()
 
 

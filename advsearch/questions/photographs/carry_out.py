@@ -32,7 +32,7 @@ from advsearch.questions.photographs import result
 from advsearch.questions.photographs.result import LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
 from advsearch.questions.sweep.carry_out import scenes_of
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
+from advsearch.runs.directory import CONFIG, PHOTOGRAPHS, RunDirectory, find_run
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.settings import read_yaml
 from advsearch.statistics.intervals import clopper_pearson
@@ -139,6 +139,11 @@ class Photographs:
     def agreement(self, run: Path) -> PhotoAgreement:
         return photo_agreement(run)
 
+    @staticmethod
+    def list_files(folder: Path, task: AnyTask) -> list[Path]:
+        """Return the files in a folder that are photographs; errors as for `photographs_in`."""
+        return photographs_in(folder, task)
+
     def _add(self, run: Path, rendering: str | None, data: bytes, source: str) -> None:
         """Judge and keep a photograph of the file `source`; without a rendering only what the models say is kept."""
         file, kind, sound, kept = None, PHOTO if rendering else LOOSE_PHOTO, b"", dict[str, JsonValue](source=source)
@@ -171,7 +176,7 @@ class Photographs:
                 row = judged(Row(kind, number, values=values), judge.judgement(rendering, shown, sound))
                 rows.append(replace(row, payload={"photo": {**kept}, "answer": row.payload}))
             if file is not None:
-                write_bytes(run / IMAGES / result.FOLDER / str(kept["file"]), sound)
+                write_bytes(run / PHOTOGRAPHS / str(kept["file"]), sound)
             held.record(*rows)
 
 

@@ -1,4 +1,4 @@
-"""How renderings and photographs of the same configurations agree, and what the dashboard's server answers about it.
+"""How renderings and photographs of the same configurations agree, and the page on which they are taken.
 
 A rendering is named as its file is: a sweep's by the number of its picture, an attack's ``adversarial``, ``clean`` or
 ``verification-00``. A photograph comes from a browser, so nothing in it is believed: it is measured before it is
@@ -9,16 +9,10 @@ page lays a rendering, translucent or its edges, over the camera's picture, afte
 
 from __future__ import annotations
 
-import hmac
 import io
-import json
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from email.message import Message
-from http import HTTPStatus
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from PIL import Image, ImageOps
 from pydantic import Field
@@ -27,17 +21,14 @@ from advsearch.errors import InputError
 from advsearch.report import wording
 from advsearch.report.shown import Html, element, join_html
 from advsearch.report.wording import percent
-from advsearch.runs.directory import IMAGES
+from advsearch.runs.directory import IMAGES, PHOTOGRAPHS
 from advsearch.runs.results import Fields, Interval
-from advsearch.trust.pages import Refused
 from advsearch.viewer.clients import LARGEST_SENT, NO_QR, qr_code
 from advsearch.viewer.document import data_script, document, in_address, study_table
 from advsearch.viewer.thumbnails import kept_file, kept_pictures
 
 PHOTO, LOOSE_PHOTO = "photo", "loose photo"
 """Kinds of rows in a run's store: photographs that were aligned with a rendering, and ones that were with none."""
-
-FOLDER = "photos"  # where photographs are, in `images/` of the run
 
 
 class PhotographedRendering(Fields):
@@ -75,8 +66,6 @@ SIDE, QUALITY = 1024, 95  # longest side in pixels of a photograph that is kept,
 _NAME = re.compile(r"[0-9]{1,12}|clean|adversarial|verification-[0-9]{2}")
 _PHOTO = re.compile(rf"(?:{_NAME.pattern})-[0-9]{{4,9}}\.jpg")
 
-KEY = "X-Advsearch-Key"  # the header with which this server's page sends a photograph; another page could not send it
-
 
 def rendering_file(run: Path, name: str) -> Path:
     """Return the file of a rendering; an InputError where the run has none of that name."""
@@ -98,7 +87,7 @@ def rendering_names(run: Path) -> tuple[str, ...]:
 
 def photo_file(run: Path, name: str) -> Path:
     """Return the file of a photograph that was kept; an InputError where there is none of that name."""
-    file = run / IMAGES / FOLDER / name
+    file = run / PHOTOGRAPHS / name
     if not _PHOTO.fullmatch(name) or not file.is_file():
         raise InputError("photo: there is none of that name")
     return file
@@ -192,47 +181,3 @@ def table_html(table: PhotoAgreement) -> Html:
         element("p", text),
         element("div", each, class_="scroll", tabindex="0", role="region", aria_label="by rendering"),
     )
-
-
-# ---- what the server answers ----------------------------------------------------------------------------------------
-
-
-def photographs_html(taker: Any, run: Path, name: str, key: str, elsewhere: str | None) -> str:
-    """Return the page of a run's photographs; arguments as for `align_page`."""
-    return align_page(name, rendering_names(run), _there(taker).agreement(run), key, elsewhere)
-
-
-def picture(find: str, run: Path, name: str) -> tuple[str, bytes]:
-    """Return the type and the data of a "rendering", or of a "photo" that was kept."""
-    with _refused(HTTPStatus.NOT_FOUND):
-        file = rendering_file(run, name) if find == "rendering" else photo_file(run, name)
-    return "image/png" if file.suffix == ".png" else "image/jpeg", file.read_bytes()
-
-
-def take(taker: Any, run: Path, name: str, headers: Message, key: str, data: Callable[[], bytes]) -> tuple[str, bytes]:
-    """Take a photograph of a rendering in, from this server's own page: another one has no origin, or not the key.
-    `data` reads what was sent, once there is something to compare it with. It is refused where there is no such
-    rendering, or it is no photograph."""
-    sent = headers.get(KEY, "").encode("utf-8", "replace")
-    if headers.get("Origin") is None or not hmac.compare_digest(key.encode(), sent):
-        raise Refused(HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew")
-    with _refused(HTTPStatus.NOT_FOUND):
-        rendering_file(run, name)
-    with _refused(HTTPStatus.BAD_REQUEST):
-        table = _there(taker).add(run, name, data())
-    return "application/json", json.dumps({"table": str(table_html(table))}).encode()
-
-
-def _there(taker: Any) -> Any:
-    if taker is None:
-        raise Refused(HTTPStatus.NOT_FOUND, "this server takes no photographs; advsearch dashboard does")
-    return taker
-
-
-@contextmanager
-def _refused(status: HTTPStatus) -> Iterator[None]:
-    """What an InputError says is sent, with a status."""
-    try:
-        yield
-    except InputError as error:
-        raise Refused(status, str(error)) from None

@@ -138,8 +138,6 @@ def replay(attack: str | Path | AttackResult, *, progress: Watched = None, **opt
     Args:
         attack: one that was kept and has ended: its result, or name or folder of its run.
     """
-    from advsearch.questions.replay import replay as experiment  # which names this function
-
     parts, only_now, run = None, list[settings.PythonOnly](), attack
     if isinstance(attack, AttackResult):
         if attack.run is None:
@@ -149,7 +147,10 @@ def replay(attack: str | Path | AttackResult, *, progress: Watched = None, **opt
         parts = None if attack.parts is None else attack.parts()
     config = workbench.configured(ReplayConfig, attack=run, **options)
     config = config.with_only_here(only_now) if only_now else config
-    return experiment.run(config, progress=workbench.watcher(progress), parts=parts)
+    made: ReplayResult = workbench.get_experiment("replay").run(
+        config, progress=workbench.watcher(progress), parts=parts
+    )
+    return made
 
 
 def rendered_again(asked: RunContext[ReplayConfig], parts: workbench.AttackParts | None = None) -> ReplayResult:

@@ -17,7 +17,6 @@ from advsearch import __version__
 from advsearch.config import DEFAULT_ENVIRONMENT
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.photographs.result import FOLDER, PHOTO, PhotoAgreement
 from advsearch.questions.report.recorded import (
     CLAIM,
     RecordedSettings,
@@ -35,9 +34,8 @@ from advsearch.registry import get_experiment
 from advsearch.report import wording
 from advsearch.report.shown import Claim, claim, counted, nothing_claimed, share_text, shown
 from advsearch.report.wording import interval_text, number_text, percent
-from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, typed_name
+from advsearch.runs.directory import CONFIG, IMAGES, PARTS, PHOTOGRAPHS, find_run, is_run, typed_name
 from advsearch.runs.results import RUNNING, Interval, Result, VariedValue
-from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Row, Store
 from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.runs.summary import read_result
@@ -281,7 +279,8 @@ def claims_of(result: Result) -> list[Claim]:
     return [nothing_claimed(f"the command {result.command} does not measure how often a model is right")]
 
 
-def photo_claims(photos: PhotoAgreement) -> list[Claim]:
+def photo_claims(photos: Any) -> list[Claim]:
+    """Return the claim of a table of agreement (`advsearch.photo_agreement`); none where it is empty."""
     if not photos.photos or photos.interval is None:
         return []
     agreeing = photos.right_right + photos.wrong_wrong
@@ -488,12 +487,12 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
             command_line=f"advsearch run {folder / CONFIG}",
         )  # fmt: skip
     result, photographs, rows = read_result(folder), list[Claim](), list[Row]()
-    if (folder / IMAGES / FOLDER).is_dir():
-        from advsearch.questions.photographs.carry_out import photo_agreement  # it brings torch, which takes a second
+    if (folder / PHOTOGRAPHS).is_dir():
+        from advsearch.extend import workbench  # it brings torch, which takes a second
 
-        photographs = photo_claims(photo_agreement(folder))
-        with Store(folder / STORE, read_only=True) as store:
-            rows = list(store.rows(PHOTO)) if photographs else []
+        photographs = photo_claims(workbench.load_photographs().agreement(folder))
+        with Store.open_to_read(folder) as store:
+            rows = list(store.rows("photo")) if photographs else []
     claims = [*claims_of(result), *photographs]
     sweeps = sweeps_read(result)
     read = [*sweeps, *attacks_read(settings)]
