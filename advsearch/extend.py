@@ -14,11 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from advsearch import seeds as seeds
+    from advsearch import settings as settings
     from advsearch import statistics as statistics
+    from advsearch.api import workbench as workbench
     from advsearch.attacks import Domain as Domain
     from advsearch.attacks import Evaluation as Evaluation
     from advsearch.attacks import Policy as Policy
     from advsearch.attacks import Proposal as Proposal
+    from advsearch.config import DerivativeConfig as DerivativeConfig
     from advsearch.config import SceneConfig as SceneConfig
     from advsearch.controls.base import Choice as Choice
     from advsearch.controls.base import Control as Control
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
     from advsearch.controls.ranges import Fixed as Fixed
     from advsearch.controls.ranges import OneOf as OneOf
     from advsearch.controls.ranges import Range as Range
+    from advsearch.engine import gradients as gradients
     from advsearch.engine.problem import Problem as Problem
     from advsearch.errors import FileFormatError as FileFormatError
     from advsearch.errors import InputError as InputError
@@ -47,6 +51,7 @@ if TYPE_CHECKING:
     from advsearch.report.shown import InNotebook as InNotebook
     from advsearch.report.shown import ResultPart as ResultPart
     from advsearch.report.shown import ShownResult as ShownResult
+    from advsearch.runs import results as results
     from advsearch.runs.directory import RunDirectory as RunDirectory
     from advsearch.runs.directory import find_run as find_run
     from advsearch.runs.exporters import Exported as Exported
@@ -56,6 +61,7 @@ if TYPE_CHECKING:
     from advsearch.runs.results import RunResult as RunResult
     from advsearch.runs.store import Store as Store
     from advsearch.runs.summary import read_result as read_result
+    from advsearch.scene import assets as assets
     from advsearch.scene import color as color
     from advsearch.scene import geometry as geometry
     from advsearch.scene.description import SceneDescription as SceneDescription
@@ -70,7 +76,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "advsearch.attacks": ("Domain", "Evaluation", "Policy", "Proposal"),
-    "advsearch.config": ("SceneConfig",),
+    "advsearch.config": ("DerivativeConfig", "SceneConfig"),
     "advsearch.controls.base": ("Choice", "Control", "Parameter", "Values"),
     "advsearch.controls.ranges": ("Fixed", "OneOf", "Range"),
     "advsearch.engine.problem": ("Problem",),
@@ -93,12 +99,17 @@ _NAMES = {
 """The names of the interface, by the module that each is imported from."""
 
 _MODULES = {
+    "assets": "advsearch.scene.assets",
     "color": "advsearch.scene.color",
     "figures": "advsearch.report.figures",
     "geometry": "advsearch.scene.geometry",
+    "gradients": "advsearch.engine.gradients",
+    "results": "advsearch.runs.results",
     "seeds": "advsearch.seeds",
+    "settings": "advsearch.settings",
     "statistics": "advsearch.statistics",
     "wording": "advsearch.report.wording",
+    "workbench": "advsearch.api.workbench",
 }
 """Modules of functions that belong to the interface as a whole."""
 

@@ -215,6 +215,10 @@ class RunDirectory:
         """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and return its path."""
         return write_bytes(self.path / IMAGES / f"{name}.gif", files.animation_bytes(frames))
 
+    def write_file(self, name: str, data: bytes) -> Path:
+        """Write a file of the run, whose name is relative to the run directory, and return its path."""
+        return write_bytes(self.path / name, data)
+
     def write_summary(self, result: Result) -> Path:
         return summary.write_summary(self.path, result)
 

@@ -13,7 +13,6 @@ import advsearch.questions.test.counterexamples as beside
 import advsearch.questions.test.result as room
 import advsearch.questions.test.settings as suites
 from advsearch.config import SceneConfig
-from advsearch.engine.record import Results
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
@@ -101,11 +100,11 @@ class _SuiteRun:
     results: list[ClaimResult] = field(default_factory=list)
 
     def carry_out(self) -> str:
-        trial, stored = self.trial, Results(self.trial.run)
+        trial = self.trial
         try:
             with interruptible():
                 for number, claim in enumerate(self.planned, start=1):
-                    self._add(claim, self._tried(claim, stored))
+                    self._add(claim, self._tried(claim))
                     trial.progress.message(f"{claim.name}: {self.results[-1].answer}: {self.results[-1].reason}")
                     if number < len(self.planned):
                         trial.run.write_summary(self.result(INTERRUPTED, None))  # what a kill leaves
@@ -117,9 +116,9 @@ class _SuiteRun:
             trial.warnings.append("A counterexample failed, so that no claim was tried; `all` goes on with them.")
         return OUT_OF_TIME if any(TIME_OVER in tried.reason for tried in self.results) else "done"
 
-    def _tried(self, claim: PlannedClaim, results: Results) -> ClaimResult:
+    def _tried(self, claim: PlannedClaim) -> ClaimResult:
         key, trial = f"claim {claim.name}", self.trial
-        if (stored := results.stored(key)) is not None:
+        if (stored := trial.run.store.noted(key)) is not None:
             return ClaimResult.of(stored)
         failed = any(known.kind == "counterexample" and not known.accepted for known in self.results)
         if failed and claim.example is None and not trial.config.all:
@@ -138,7 +137,7 @@ class _SuiteRun:
             raise KeyboardInterrupt
         tried = tried.model_copy(update={"seconds": time.perf_counter() - begun})
         if TIME_OVER not in tried.reason:
-            results.put(key, tried.to_dict())
+            trial.run.store.set_note(key, json.dumps(tried.to_dict()))
         return tried
 
     def _not_tried(self, claim: PlannedClaim, reason: str) -> ClaimResult:
