@@ -11,9 +11,11 @@ from advsearch.attacks import SearchResult as SearchResult
 from advsearch.attacks import make_policy as make_policy
 from advsearch.attacks import search as search
 from advsearch.controls import CONTROLS as CONTROLS
+from advsearch.controls.support.meshes import sphere as sphere
 from advsearch.engine.judging import domain_of as domain_of
 from advsearch.engine.loading import Scene as Scene
 from advsearch.engine.loading import load_scene as load_scene
 from advsearch.engine.naming import settings_alone as settings_alone
 from advsearch.questions.attack.carry_out import LOADING as LOADING
 from advsearch.questions.attack.carry_out import problem_from_config as problem_from_config
+from advsearch.scene.parts import PluginPart as PluginPart
