@@ -498,17 +498,6 @@ def _positive(value: Any) -> float:
     return number
 
 
-class TimedConfig(Config):
-    """A question that may run out of time."""
-
-    # fmt: off
-    seconds: float | None = setting(
-        None, "check",
-        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
-        otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
-    )
-
-
 FIRST = ("attack", "render", "sweep")  # the commands that the docs show first
 
 

@@ -19,13 +19,14 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar, get_args, get_type_hints
 
-from advsearch import registry
+from advsearch import registry, threads
 from advsearch.errors import FELL_SHORT
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, watcher
 from advsearch.report.shown import Claim, ShownResult, result_figure, shown
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, is_run
 from advsearch.runs.listing import finished
+from advsearch.runs.measurements import Measurements
 from advsearch.runs.results import INTERRUPTED, Result
 from advsearch.runs.summary import read_result
 from advsearch.settings import Config
@@ -97,6 +98,15 @@ class RunContext(ExitStack, Generic[Settings]):
     def run_part(self, name: str, config: Config) -> Result:
         """Run an experiment in a folder of its own within this run, or read its result if it has ended."""
         return run_part(RunDirectory.locate_part(self.run.path, name), config, self.progress)
+
+    def open_measurements(self, seconds: float | None = None) -> Measurements:
+        """Return what the run has measured, and what measures the rest; none begins after so many seconds."""
+        return Measurements(self, seconds)
+
+    @property
+    def machine(self) -> dict[str, Any]:
+        """What measured times depend on: the processor's name, and the cores that this process may use."""
+        return {"cpu": threads.read_processor_name(), "cores": threads.cores()}
 
     def result(self, result_type: type[Made], **fields: Any) -> Made:
         """Return a result with the given fields and those that every result has.

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from advsearch.attacks import Evaluation as Evaluation
     from advsearch.attacks import Policy as Policy
     from advsearch.attacks import Proposal as Proposal
+    from advsearch.config import DerivativeConfig as DerivativeConfig
     from advsearch.config import SceneConfig as SceneConfig
     from advsearch.controls.base import Choice as Choice
     from advsearch.controls.base import Control as Control
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from advsearch.controls.ranges import OneOf as OneOf
     from advsearch.controls.ranges import Range as Range
     from advsearch.controls.support import images as images
+    from advsearch.engine import gradients as gradients
     from advsearch.engine.problem import Problem as Problem
     from advsearch.errors import FileFormatError as FileFormatError
     from advsearch.errors import InputError as InputError
@@ -81,7 +83,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "advsearch.attacks": ("Domain", "Evaluation", "Policy", "Proposal"),
-    "advsearch.config": ("SceneConfig",),
+    "advsearch.config": ("DerivativeConfig", "SceneConfig"),
     "advsearch.controls.base": ("Choice", "Control", "Parameter", "Values"),
     "advsearch.controls.ranges": ("Fixed", "OneOf", "Range"),
     "advsearch.engine.problem": ("Problem",),
@@ -108,6 +110,7 @@ _MODULES = {
     "color": "advsearch.scene.color",
     "figures": "advsearch.report.figures",
     "geometry": "advsearch.scene.geometry",
+    "gradients": "advsearch.engine.gradients",
     "images": "advsearch.controls.support.images",
     "parts": "advsearch.scene.parts",
     "results": "advsearch.runs.results",

@@ -10,6 +10,7 @@ library only.
 from __future__ import annotations
 
 import os
+import platform
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +22,7 @@ from advsearch.errors import InputError
 OPENMP_DEFAULTS = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
 """Idle threads sleep at once: the first for GNU OpenMP (torch on Linux), the second for LLVM's and Intel's (macOS)."""
 _CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
+_CPU_INFO = Path("/proc/cpuinfo")
 _USERS_COUNT = os.environ.get("OMP_NUM_THREADS", "")
 
 if "GOMP_SPINCOUNT" not in os.environ:  # a user who has set this has decided about waiting
@@ -40,6 +42,18 @@ def cores(quota: Path = _CPU_MAX) -> int:
     except (OSError, ValueError):  # no control groups, or "max": no quota
         pass
     return allowed
+
+
+def read_processor_name(cpu_info: Path = _CPU_INFO) -> str:
+    """Return the processor's name; what the system says where Linux's description has none."""
+    try:
+        for line in cpu_info.read_text(encoding="utf-8", errors="replace").splitlines():
+            key, _, value = line.partition(":")
+            if key.strip().lower() == "model name" and value.strip():
+                return " ".join(value.split())
+    except OSError:
+        pass
+    return platform.processor() or platform.machine() or "unknown"
 
 
 MOST = 4  # of threads for each core: more only wait for each other, and somebody else's file may ask for any number

@@ -34,7 +34,7 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.engine.gradients import Bench, Loss, inside, only, smooth_loss  # noqa: E402
+from advsearch.engine.gradients import Bench, Loss, interior_point, restrict_plan, smooth_loss  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.questions.attack.carry_out import problem_from_config  # noqa: E402
 from advsearch.questions.attack.settings import AttackConfig  # noqa: E402
@@ -154,7 +154,7 @@ def compare_denoised(size: int, repeats: int) -> int:
         problem, _ = problem_from_config(config)
         renderer, loss = problem.renderer, problem.loss
         start = renderer.start * (1.0 - 2.0 * HALF) + HALF
-        adjoint = only(renderer.plan, {"texture.texels"}, "adjoint")
+        adjoint = restrict_plan(renderer.plan, {"texture.texels"}, "adjoint")
         own = Bench(renderer, loss, start, seed=0, spp=256).gradient(adjoint, 999)
         kinds = directions(own)
         for spp in (4, 16, 64, 256):
@@ -212,9 +212,9 @@ def _others(count: int) -> list[Tensor]:
 
 def measure(renderer: Renderer, estimators: Sequence[str], repeats: int) -> Iterator[tuple[str, float, float, float]]:
     """Yield estimator, median seconds, root mean square relative error, and squared error x seconds."""
-    bench = Bench(renderer, smooth_loss(renderer.formation.resolution), inside(renderer), seed=0, spp=64)
+    bench = Bench(renderer, smooth_loss(renderer.formation.resolution), interior_point(renderer), seed=0, spp=64)
     names = {group.name for group in renderer.plan.groups}
-    differences = only(renderer.plan, names, "differences")
+    differences = restrict_plan(renderer.plan, names, "differences")
     references = [bench.gradient(differences, 1000 + number) for number in range(6)]
     truth = torch.stack(references).mean(dim=0)
     for estimator in estimators:
@@ -224,7 +224,7 @@ def measure(renderer: Renderer, estimators: Sequence[str], repeats: int) -> Iter
             taken = "material"
         for number in range(repeats):
             begun = time.perf_counter()
-            gradient = replace(bench, spp=SPP).gradient(only(renderer.plan, names, taken), number)
+            gradient = replace(bench, spp=SPP).gradient(restrict_plan(renderer.plan, names, taken), number)
             seconds.append(time.perf_counter() - begun)
             errors.append(_squared(gradient - truth) / _squared(truth))
         mean = statistics.fmean(errors)

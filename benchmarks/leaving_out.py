@@ -36,9 +36,9 @@ from advsearch import seeds
 from advsearch.controls import CONTROLS, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.acceptance import CHECK_SPP, levels_off
-from advsearch.engine.gradients import inside, smooth_loss
+from advsearch.engine.gradients import interior_point, smooth_loss
+from advsearch.engine.gradients.planning import bounces_of
 from advsearch.engine.loading import as_controls, framed, load_scene, make_renderer
-from advsearch.engine.planning import bounces_of
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
 from advsearch.questions.attack.carry_out import problem_from_config
@@ -173,7 +173,7 @@ def picture(
 def measured(pair: tuple[str, str, str], size: int, spp: int, repeats: int) -> dict[str, Any]:
     """One pair: times, errors, gains."""
     problem = problem_of(pair, size, pair[2])
-    lean, u, loss = problem.renderer, inside(problem.renderer), smooth_loss((size, size))
+    lean, u, loss = problem.renderer, interior_point(problem.renderer), smooth_loss((size, size))
     full = lean.like(lean.scene.like(leave_out=NOTHING))
     depth = bounces_of(problem, 0).depth
     ways = [lean, full, lean.like(lean.scene.like(max_depth=depth))]

@@ -23,7 +23,7 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
+from advsearch.engine.gradients import interior_point, smooth_loss  # noqa: E402
 from advsearch.questions.attack.carry_out import problem_from_config  # noqa: E402
 from advsearch.questions.precision import precision  # noqa: E402
 from advsearch.questions.precision.benches import GradientBench, PictureBench, TimeBudget, gradient_parts  # noqa: E402
@@ -156,7 +156,7 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
         renderer.plan = renderer.plan.at_a_pixel()
         part = next(one for one in gradient_parts(renderer.plan.groups, linear=True) if one.name == found.control)
         loss = smooth_loss(renderer.formation.resolution, config.seed)
-        bench = GradientBench(renderer, loss, inside(renderer), part)
+        bench = GradientBench(renderer, loss, interior_point(renderer), part)
     bench.refer(budget, SEED, lambda: None)
     samples = [bench.measure(setting, SEED + number)[found.quantity] for number in range(REPEATS)]
     point = point_of(setting, samples, floor=bench.floor(setting, found.quantity))

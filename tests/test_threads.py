@@ -69,3 +69,10 @@ def test_a_file_that_asks_for_very_many_threads_gets_a_few_for_each_core() -> No
 def test_fewer_than_one_thread_is_an_error(wrong: int) -> None:
     with pytest.raises(InputError, match=rf"threads: expected a number of at least 1, got {wrong}"):
         threads.configure(wrong)
+
+
+def test_the_processor_is_named(tmp_path: Path) -> None:
+    info = tmp_path / "cpuinfo"
+    info.write_text("processor : 0\nmodel name : An  Example CPU\n", encoding="utf-8")
+    assert threads.read_processor_name(info) == "An Example CPU"
+    assert threads.read_processor_name(tmp_path / "none")

@@ -35,7 +35,6 @@ from advsearch.registry import imported
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 from advsearch.trust.code import allow_code
 
-_CPU_INFO = Path("/proc/cpuinfo")
 PACKAGES = ("mitsuba", "drjit", "torch", "numpy")  # whose versions decide last bits
 
 MachineInfo = dict[str, str]
@@ -44,7 +43,7 @@ MachineInfo = dict[str, str]
 @cache
 def this_machine() -> MachineInfo:
     llvm = ".".join(map(str, ensure_llvm().version))
-    return {"processor": processor(), "LLVM": llvm, **{name: _version(name) for name in PACKAGES}}
+    return {"processor": threads.read_processor_name(), "LLVM": llvm, **{name: _version(name) for name in PACKAGES}}
 
 
 def machine_name(machine: MachineInfo) -> str:
@@ -59,18 +58,6 @@ def version() -> str:
     for path in sorted(folder.rglob("*.py")):
         digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return f"{_version('advsearch')}+{digest.hexdigest()[:8]}"
-
-
-def processor(cpu_info: Path = _CPU_INFO) -> str:
-    """Return the processor's name; what the system says where Linux's description has none."""
-    try:
-        for line in cpu_info.read_text(encoding="utf-8", errors="replace").splitlines():
-            key, _, value = line.partition(":")
-            if key.strip().lower() == "model name" and value.strip():
-                return " ".join(value.split())
-    except OSError:
-        pass
-    return platform.processor() or platform.machine() or "unknown"
 
 
 def _version(package: str) -> str:

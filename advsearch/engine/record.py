@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
 from torch import Tensor
 
 from advsearch.attacks import SampleCount, SearchResult, Trials, Verification, count_right
 from advsearch.attacks.candidates import Bracket
 from advsearch.engine.transport import PredictedSearch
-from advsearch.interrupts import interruptible
 from advsearch.options import NOT_A_NUMBER, Value, count_outcomes
 from advsearch.progress import Progress
 from advsearch.report.wording import count
-from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME, ControlGroup, Fields, Result, VerifiedRate
+from advsearch.runs.results import ControlGroup, VerifiedRate
 from advsearch.runs.store import Row
-from advsearch.runs.summary import NAME, stored_result
 from advsearch.scene.predictor import Refusal
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.base import mean
@@ -164,73 +160,3 @@ def mean_number(values: Iterable[float]) -> float:
     """Return the mean of those that are numbers; NaN where none is."""
     numbers = [value for value in values if not math.isnan(value)]
     return mean(numbers) if numbers else math.nan
-
-
-Kept = TypeVar("Kept")
-Ending = TypeVar("Ending", bound=Result)
-Kind = TypeVar("Kind", bound=Fields)
-
-
-class OutOfTime(Exception):
-    """The time that a measurement was given is over."""
-
-
-class Results:
-    """What a run has measured, in its store; measures what is not there, until the time is up: one measurement is
-    always made, so that it gets on. `made` counts them; what is stored is read back before the first."""
-
-    def __init__(self, run: RunDirectory | None, seconds: float | None = None) -> None:
-        self._run = run
-        self._end = math.inf if seconds is None else time.monotonic() + seconds
-        self.made = 0
-
-    def get(self, key: str, measure: Callable[[], Any]) -> Any:
-        """Return the JSON value that is stored under a key, or what `measure` returns in time, and store it."""
-        stored = self.stored(key)
-        if stored is None:
-            if self.made and time.monotonic() >= self._end:
-                raise OutOfTime
-            self.made += 1
-            stored = json.loads(json.dumps(measure()))
-            self.put(key, stored)
-        return stored
-
-    def row(self, key: str, kind: type[Kind], measure: Callable[[], Kind]) -> Kind:
-        """Return the fields that `measure` returns, or those of this kind that are stored; otherwise as `get`."""
-        return kind.of(self.get(key, lambda: measure().to_dict()))
-
-    def rows(self, key: str, kind: type[Kind], measure: Callable[[], Sequence[Kind]]) -> list[Kind]:
-        return [kind.of(row) for row in self.get(key, lambda: [row.to_dict() for row in measure()])]
-
-    def put(self, key: str, value: Any) -> None:
-        if self._run is not None:
-            self._run.store.set_note(key, json.dumps(value))
-
-    def stored(self, key: str) -> Any:
-        return None if self._run is None else self._run.store.noted(key)
-
-
-def taken_rows(asked: Any, results: Results, rows: Iterable[Kept], result: Callable[[list[Kept]], Ending]) -> Ending:
-    """Take rows until they end, the time is up or there is an interrupt, and write what they come to after each, into
-    the run of what is `asked` (`experiment.RunContext`).
-
-    The summary never has fewer rows than an earlier sitting left in it: those are read back first.
-    """
-    taken: list[Kept] = []
-    asked.ending = INTERRUPTED
-    try:
-        with interruptible():
-            for row in rows:
-                taken.append(row)
-                if results.made:
-                    asked.run.write_summary(result(taken))  # what a kill leaves
-            asked.ending = "done"
-    except KeyboardInterrupt:
-        pass
-    except OutOfTime:
-        asked.ending = OUT_OF_TIME
-    made = result(taken)
-    if asked.ending == INTERRUPTED and not results.made and (asked.run.path / NAME).is_file():
-        before = stored_result(asked.run.path)
-        return before if isinstance(before, type(made)) else made
-    return made

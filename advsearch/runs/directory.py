@@ -231,10 +231,6 @@ class RunDirectory:
         """Return the folder of a part of a run, whether it exists or not."""
         return run / PARTS / name
 
-    def write_file(self, name: str, data: bytes) -> Path:
-        """Write a file of the run, whose name is relative to the run directory, and return its path."""
-        return write_bytes(self.path / name, data)
-
     def save_image(self, name: str, image: Any, folder: str = IMAGES) -> Path:
         """Write ``<folder>/<name>.png`` of (H, W, 3) or (H, W), display-referred sRGB in [0, 1], numpy or torch; return
         its path."""
@@ -247,6 +243,10 @@ class RunDirectory:
     def save_animation(self, name: str, frames: Sequence[Any]) -> Path:
         """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and return its path."""
         return write_bytes(self.path / IMAGES / f"{name}.gif", files.animation_bytes(frames))
+
+    def write_file(self, name: str, data: bytes) -> Path:
+        """Write a file of the run, whose name is relative to the run directory, and return its path."""
+        return write_bytes(self.path / name, data)
 
     def write_summary(self, result: Result) -> Path:
         return summary.write_summary(self.path, result)

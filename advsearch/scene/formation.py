@@ -144,8 +144,8 @@ ITEMS: Mapping[str, str] = {
 
 None of it changes what is computed: pictures and gradients with and without agree to within their noise, and where the
 random numbers are the same ones, to within rounding, which `advsearch check` shows on the scene at hand. Bounces of
-light are another matter (`engine.path_length`): leaving those out has a bias, so only the search does it, within a
-measured bound, and the verification renders all of them."""
+light are another matter (`engine.gradients.planning`): leaving those out has a bias, so only the search does it, within
+a measured bound, and the verification renders all of them."""
 
 EVERYTHING = frozenset(ITEMS)  # leave out all that can be
 NOTHING: frozenset[str] = frozenset()  # leave out nothing: what a program has to do that knows neither scene nor search

@@ -1,7 +1,7 @@
 """The gradient plan: how the derivative of every coordinate of u is obtained (docs/gradients.md).
 
 A control's groups of coordinates declare which estimators are valid for them. Where only one is, the plan takes it;
-where several are, it takes the first, until a measurement on the actual scene (`advsearch.engine.planning`)
+where several are, it takes the first, until a measurement on the actual scene (`advsearch.engine.gradients.planning`)
 says which has the least variance x time. Any of them can be forced by name.
 """
 

@@ -212,6 +212,11 @@ class Renderer:
             first, second = (self.space.picture(u, there + (half - there) / SMALL_PART) for half in moved)
             return first, second, self.space.picture(u, there)
 
+    def traced_inputs(self, u: Tensor) -> dict[str, Tensor]:
+        """Return what the scene gets of a configuration (d,), by name, without a graph."""
+        inputs = self.scene.assembly(self.space.inputs(u))
+        return {name: value.detach() for name, value in _traced(inputs).items()}
+
     def mask(self, u: Configuration) -> Tensor:
         """Return the pixels in which the object is the first thing that the camera sees, (H, W) bool. It is asked for
         at the middle of each pixel. What controls do to the finished picture moves nothing in it."""

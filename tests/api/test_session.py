@@ -307,7 +307,7 @@ def test_instances_and_names_go_together_in_every_question(
         seen.append(problem_from_config(config)[0])
         raise ZeroDivisionError
 
-    monkeypatch.setattr("advsearch.questions.check.carry_out.problem_from_config", loaded)
+    monkeypatch.setattr("advsearch.api.workbench.problem_from_config", loaded)
     with pytest.raises(ZeroDivisionError):
         advsearch.check("mug", controls=mixed, run=tmp_path / "check", **small)
     assert [bound.name for bound in seen[0].space.controls] == ["faded", "pose"]

@@ -18,7 +18,7 @@ from advsearch.api.projection import write_projection
 from advsearch.controls import make_control
 from advsearch.controls.projector import AMBIENT, ProjectorControl, ambient_irradiance
 from advsearch.controls.space import Space
-from advsearch.engine.gradients import inside
+from advsearch.engine.gradients import interior_point
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.files import read_png, write_png
@@ -117,7 +117,7 @@ def test_the_adjoint_is_the_difference() -> None:
 def test_a_black_picture_is_checked_at_grey() -> None:
     """At black there is a bend, of which differences to both sides see the half."""
     renderer = renderer_of()
-    assert not bool(renderer.start.any()) and bool((inside(renderer) == 0.5).all())
+    assert not bool(renderer.start.any()) and bool((interior_point(renderer) == 0.5).all())
 
 
 @pytest.mark.slow

@@ -19,13 +19,15 @@ from advsearch.engine.gradients import (
     Estimate,
     Probe,
     Reference,
-    agreement,
-    attempts,
-    inside,
-    only,
+    compare_with_reference,
+    find_probes,
+    interior_point,
+    list_attempts,
+    measure_reference,
+    restrict_plan,
     smooth_loss,
 )
-from advsearch.engine.planning import TELLS, contested, cosines, measured_plan, status_of, tuned
+from advsearch.engine.gradients.planning import TELLS, contested, cosines, measured_plan, status_of, tuned
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
@@ -100,7 +102,7 @@ def test_every_estimator_that_a_control_names_exists() -> None:
 def test_differences_are_central_differences_of_the_picture_with_one_seed() -> None:
     render = renderer(["camera"], estimators={"*": "differences"})
     weights = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(1))
-    u = inside(render)
+    u = interior_point(render)
     leaf = u.clone().requires_grad_()
     before = render.renders
     (render(leaf, seed=3, spp=4) * weights).sum().backward()
@@ -158,7 +160,7 @@ def test_the_azimuth_of_the_mug_has_the_sign_of_what_the_loss_does_over_degrees(
 
 def test_a_secant_differences_the_loss_itself() -> None:
     render = renderer(["camera.elevation"], estimators={"*": "secant"}, transfer="srgb")
-    u = inside(render)
+    u = interior_point(render)
 
     def bent(image: Tensor) -> Tensor:
         return torch.sigmoid(30.0 * (image.mean() - 0.45))
@@ -190,7 +192,7 @@ def test_a_full_turn_meets_itself() -> None:
 
 def test_the_free_part_of_a_gradient_takes_no_render_of_its_own() -> None:
     render = renderer({"environment": {"exposure": [-1, 1]}, "camera": {"elevation": [5, 60]}})
-    u, before = inside(render), render.renders
+    u, before = interior_point(render), render.renders
     _, free = render.gradient(smooth_loss((SIZE, SIZE)), u, 0, 4, free=True)
     assert render.renders - before == 1
     assert float(free[0]) != 0.0 and float(free[1]) == 0.0
@@ -208,7 +210,7 @@ def test_a_texture_beside_a_pose_is_differentiated_once_and_nothing_geometric_fo
         return original(inputs, cotangent, seed, spp, wrt=wrt, method=method)
 
     monkeypatch.setattr(render.scene, "adjoint", spy)
-    _, gradient = render.gradient(smooth_loss((SIZE, SIZE)), inside(render), 0, 4)
+    _, gradient = render.gradient(smooth_loss((SIZE, SIZE)), interior_point(render), 0, 4)
     assert asked == [("path", "object.base_color")]
     assert bool(gradient[:-1].any()) and float(gradient[-1]) != 0.0
 
@@ -216,11 +218,11 @@ def test_a_texture_beside_a_pose_is_differentiated_once_and_nothing_geometric_fo
 def test_turning_an_environment_has_the_right_sign_and_size() -> None:
     """Mitsuba's own derivative of `to_world` has the wrong sign (docs/gradients.md); texels have the right one."""
     render = renderer(["environment.rotation"])
-    bench = Bench(render, smooth_loss((SIZE, SIZE)), inside(render), seed=0, spp=64)
-    by_adjoint = only(render.plan, [render.plan.groups[0].name], "adjoint")
+    bench = Bench(render, smooth_loss((SIZE, SIZE)), interior_point(render), seed=0, spp=64)
+    by_adjoint = restrict_plan(render.plan, [render.plan.groups[0].name], "adjoint")
     adjoint = torch.stack([replace(bench, spp=128).gradient(by_adjoint, seed) for seed in range(6)]).mean()
-    (probe,) = bench.probes()
-    truth = bench.reference(probe)
+    (probe,) = find_probes(bench)
+    truth = measure_reference(bench, probe)
     assert float(adjoint) * truth.value > 0.0
     assert float(adjoint) == pytest.approx(truth.value, rel=0.1)
 
@@ -231,10 +233,10 @@ def test_the_adjoint_of_a_surface_agrees_with_differences_to_a_twentieth(paramet
     """To a looser bound, with fewer samples, in tests/controls/test_control_material.py."""
     render = renderer({"material": {parameter: [0.1, 0.9]}})
     bench = Bench(render, smooth_loss((SIZE, SIZE)), torch.tensor([share]), seed=0, spp=256)
-    adjoint = only(render.plan, [render.plan.groups[0].name], "adjoint")
+    adjoint = restrict_plan(render.plan, [render.plan.groups[0].name], "adjoint")
     values = torch.stack([replace(bench, spp=128).gradient(adjoint, seed) for seed in range(6)]).flatten()
-    (probe,) = bench.probes()
-    truth = bench.reference(probe)
+    (probe,) = find_probes(bench)
+    truth = measure_reference(bench, probe)
     doubt = 3.0 * math.hypot(float(values.std()) / math.sqrt(len(values)), truth.noise)
     assert doubt < 0.5 * abs(truth.value), "too noisy to say anything"
     assert float(values.mean()) == pytest.approx(truth.value, abs=0.05 * abs(truth.value) + doubt)
@@ -289,25 +291,25 @@ def test_recordings_live_on_over_moves_and_gradients() -> None:
 
 def test_a_judgement_needs_more_than_noise() -> None:
     sure = Reference(1.0, 0.001, (1.0, 1.0), 8)
-    assert agreement(Estimate("x", 1.01, 0.05, 9, 1.0), sure).status == "ok"
-    assert agreement(Estimate("x", 1.2, 0.05, 9, 1.0), sure).status == "biased"
-    turned = agreement(Estimate("x", -1.0, 0.06, 9, 1.0), sure)
+    assert compare_with_reference(Estimate("x", 1.01, 0.05, 9, 1.0), sure).status == "ok"
+    assert compare_with_reference(Estimate("x", 1.2, 0.05, 9, 1.0), sure).status == "biased"
+    turned = compare_with_reference(Estimate("x", -1.0, 0.06, 9, 1.0), sure)
     assert (turned.status, turned.bias, turned.noise) == ("biased", 2.0, 0.06)
     assert turned.doubt == pytest.approx(0.05, rel=1e-2)
     assert turned.doubt is not None and turned.excess == 2.0 - turned.doubt
-    assert agreement(Estimate("x", 1.0, 0.5, 9, 1.0), sure).status == "noisy"
+    assert compare_with_reference(Estimate("x", 1.0, 0.5, 9, 1.0), sure).status == "noisy"
     unsure = Reference(0.1, 0.5, (0.6, 0.1), 8)
-    assert agreement(Estimate("x", 0.4, 0.1, 9, 1.0), unsure).status == "reference unusable"
-    assert agreement(Estimate("x", 0.0, 0.0, 9, 1.0), Reference(0.0, 0.0, (0.0, 0.0), 8)).bias == 0.0
+    assert compare_with_reference(Estimate("x", 0.4, 0.1, 9, 1.0), unsure).status == "reference unusable"
+    assert compare_with_reference(Estimate("x", 0.0, 0.0, 9, 1.0), Reference(0.0, 0.0, (0.0, 0.0), 8)).bias == 0.0
 
 
 def test_a_derivative_near_zero_is_judged_beside_the_others_of_its_control() -> None:
     small, large = Reference(0.01, 0.0, (0.01, 0.01), 8), Reference(5.0, 0.01, (5.0, 5.0), 8)
     off = Estimate("x", 0.03, 0.0, 9, 1.0)
-    alone, beside = agreement(off, small), agreement(off, small, [small, large])
+    alone, beside = compare_with_reference(off, small), compare_with_reference(off, small, [small, large])
     assert (alone.status, beside.status) == ("biased", "ok")
     assert [alone.bias, beside.bias] == pytest.approx([2.0, 0.04])
-    assert agreement(off, large, [small, large]).bias == agreement(off, large).bias
+    assert compare_with_reference(off, large, [small, large]).bias == compare_with_reference(off, large).bias
 
 
 def test_a_reference_of_a_parabola_has_its_bias_taken_off() -> None:
@@ -320,7 +322,7 @@ def test_a_reference_of_a_parabola_has_its_bias_taken_off() -> None:
     one = group("a.b", 0, 1, ("differences",), step=0.2)
     curve: Any = Curve()
     bench = Bench(curve, lambda image: image, torch.tensor([0.5]), seed=0, spp=1)
-    found = bench.reference(Probe(one, "a.b", torch.ones(1), 0.2))
+    found = measure_reference(bench, Probe(one, "a.b", torch.ones(1), 0.2))
     assert found.value == pytest.approx(0.75, abs=1e-4)
     assert found.steps[0] == pytest.approx(0.75 + 0.04, abs=1e-4)
 
@@ -341,7 +343,7 @@ def test_a_reference_takes_wider_steps_where_narrow_ones_are_noise() -> None:
     def found(factors: Sequence[float]) -> Reference:
         curve: Any = Curve()
         bench = Bench(curve, lambda image: image, torch.tensor([0.5]), seed=0, spp=1)
-        return bench.reference(probe, repeats=(6, 6), factors=factors)
+        return measure_reference(bench, probe, repeats=(6, 6), factors=factors)
 
     narrow, wide = found((1.0,)), found((1.0, 3.0, 9.0))
     assert narrow.noise > 0.1 and narrow.factor == 1.0 and narrow.renders == 24
@@ -351,13 +353,13 @@ def test_a_reference_takes_wider_steps_where_narrow_ones_are_noise() -> None:
 
 def test_what_falls_short_at_a_pixel_is_tried_with_other_steps() -> None:
     several = group("a.b", 0, 1, ("secant", "differences"), step=0.01)
-    assert attempts(several)[:2] == [("secant", 1.0), ("differences", 1.0)]
-    assert attempts(several)[2:] == [("differences", factor) for factor in (3.0, 9.0, 1.0 / 3.0)]
-    factors = [factor for _, factor in attempts(replace(several, step=0.05))]
+    assert list_attempts(several)[:2] == [("secant", 1.0), ("differences", 1.0)]
+    assert list_attempts(several)[2:] == [("differences", factor) for factor in (3.0, 9.0, 1.0 / 3.0)]
+    factors = [factor for _, factor in list_attempts(replace(several, step=0.05))]
     assert factors == [1.0, 1.0, 3.0, 1.0 / 3.0]  # 9 times would be as wide as 3 times
-    assert attempts(group("a.b", 0, 1, ("adjoint",))) == [("adjoint", 1.0)]
+    assert list_attempts(group("a.b", 0, 1, ("adjoint",))) == [("adjoint", 1.0)]
     forced = replace(several, estimator="secant", is_forced=True)
-    assert [name for name, _ in attempts(forced)] == ["secant"] * 4
+    assert [name for name, _ in list_attempts(forced)] == ["secant"] * 4
 
 
 def test_a_wider_step_of_one_gradient_leaves_the_plan_as_it_was() -> None:
@@ -369,14 +371,16 @@ def test_a_wider_step_of_one_gradient_leaves_the_plan_as_it_was() -> None:
         return image.sum()
 
     before = render.plan
-    Bench(render, loss, inside(render), seed=0, spp=1).gradient(only(before.with_steps(3.0), ["pose.yaw"], "secant"), 0)
+    Bench(render, loss, interior_point(render), seed=0, spp=1).gradient(
+        restrict_plan(before.with_steps(3.0), ["pose.yaw"], "secant"), 0
+    )
     assert render.plan is before
     assert max(steps) == pytest.approx(3.0 * before.groups[0].step)
 
 
 def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> None:
     render = renderer({"environment": {"rotation": [0, 360], "exposure": [-1, 1]}})
-    plan = measured_plan(Bench(render, smooth_loss((SIZE, SIZE)), inside(render), seed=0, spp=4), repeats=2)
+    plan = measured_plan(Bench(render, smooth_loss((SIZE, SIZE)), interior_point(render), seed=0, spp=4), repeats=2)
     for one in plan.groups:
         assert set(one.measured) == {"adjoint", "differences"}
         assert one.estimator == min(one.measured, key=lambda name: one.measured[name])
@@ -388,7 +392,9 @@ def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> No
 def test_a_loss_that_is_flat_keeps_what_is_preferred() -> None:
     """As of a detector that sees nothing with the right name: all gradients are nil, and none has an error."""
     render = renderer({"environment": {"exposure": [-1, 1]}})
-    plan = measured_plan(Bench(render, lambda image: 0.0 * image.sum(), inside(render), seed=0, spp=2), repeats=2)
+    plan = measured_plan(
+        Bench(render, lambda image: 0.0 * image.sum(), interior_point(render), seed=0, spp=2), repeats=2
+    )
     (one,) = plan.groups
     assert set(one.measured.values()) == {0.0}
     assert (one.estimator, one.reason) == (
@@ -403,7 +409,7 @@ def test_over_many_coordinates_an_adjoint_is_not_compared_with_differences() -> 
         for size in (24, 8)
     )
     assert contested(many) == contested(many, every=True) == []
-    assert attempts(many.groups[0]) == [("material", 1.0)]
+    assert list_attempts(many.groups[0]) == [("material", 1.0)]
     assert contested(few) == []  # material is preferred, unless all are to be compared
     assert contested(few, every=True) == [(few.groups, ("material", "differences"))]
 

@@ -17,18 +17,19 @@ import pytest
 
 import advsearch
 from advsearch.cli.main import main
-from advsearch.engine import planning
-from advsearch.engine.planning import cosine_samples, cosines
-from advsearch.engine.record import OutOfTime, Results
+from advsearch.engine.gradients import planning
+from advsearch.engine.gradients.planning import cosine_samples, cosines
 from advsearch.errors import InputError
+from advsearch.experiment import RunContext
 from advsearch.interrupts import INTERRUPTS
-from advsearch.progress import NullProgress, Progress
+from advsearch.progress import NullProgress
 from advsearch.questions.check import carry_out as checking
 from advsearch.questions.check import check
 from advsearch.questions.check import result as words
 from advsearch.questions.check.result import CheckConfig, CheckedRow, CheckResult, GainRow
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
+from advsearch.runs.measurements import Measurements, OutOfTime
 from advsearch.runs.results import PathLength, Result
 from advsearch.runs.summary import read_result
 
@@ -110,13 +111,13 @@ def test_a_summary_never_forgets_what_an_earlier_one_had(
     both = [checking.CheckedPart(number, CheckConfig(**SMALL), "linear") for number in (1, 2)]
     told: list[int] = []
 
-    def measured(part: checking.CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[CheckedRow]:
+    def measured(sitting: checking.GradientCheck, part: checking.CheckedPart, title: str) -> Iterator[CheckedRow]:
         for number, row in enumerate(whole.rows):
-            results.get(f"{part.key} {number}", row.to_dict)
+            sitting.measurements.get(f"{part.key} {number}", row.to_dict)
             yield row
 
-    monkeypatch.setattr(checking, "parts_of", lambda *_: both)
-    monkeypatch.setattr(checking, "_linear", measured)
+    monkeypatch.setattr(checking, "list_parts", lambda *_: both)
+    monkeypatch.setattr(checking.GradientCheck, "_measure_linear", measured)
     write = RunDirectory.write_summary
 
     def written(run: RunDirectory, answer: CheckResult) -> Path:
@@ -139,19 +140,21 @@ def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
     config = CheckConfig(**SMALL, seconds=0.001, run=str(folder))
     summary = check.run(config)
     assert summary.ending == "out of time" and not finished(folder)
-    monkeypatch.setattr(checking, "Results", lambda run, seconds=None: Results(run))  # a sitting that is longer
+    # a sitting that is longer
+    monkeypatch.setattr(RunContext, "open_measurements", lambda context, seconds=None: Measurements(context))
     assert values(check.run(config, resumed=folder)) == values(whole) and finished(folder)
     assert main(["show", str(folder)]) == 0
     assert words.READING in capsys.readouterr().out
 
 
 def test_what_is_stored_is_not_measured_again(tmp_path: Path) -> None:
-    with RunDirectory.create(tmp_path / "run") as run:
-        results = Results(run)
+    config = CheckConfig(**SMALL, run=str(tmp_path / "run"))
+    with RunContext(config) as context:
+        results = context.open_measurements()
         assert results.get("a", lambda: {"x": (0.1 + 0.2, float("inf"))}) == {"x": [0.1 + 0.2, float("inf")]}
         assert results.get("a", lambda: pytest.fail("measured again")) == {"x": [0.1 + 0.2, float("inf")]}
-    with RunDirectory.resume(tmp_path / "run") as run:
-        late = Results(run, seconds=0.0)
+    with RunContext(config, resumed=tmp_path / "run") as context:
+        late = context.open_measurements(seconds=0.0)
         assert late.get("a", lambda: pytest.fail("measured again")) == {"x": [0.1 + 0.2, float("inf")]}
         assert late.get("b", lambda: 1) == 1  # a sitting always gets on
         with pytest.raises(OutOfTime):
@@ -159,14 +162,14 @@ def test_what_is_stored_is_not_measured_again(tmp_path: Path) -> None:
 
 
 def test_a_finished_part_is_not_even_loaded(whole: CheckResult, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checking, "problem_from_config", lambda *_, **__: pytest.fail("loaded"))
+    monkeypatch.setattr(checking.workbench, "problem_from_config", lambda *_, **__: pytest.fail("loaded"))
     begun = time.process_time()
     again = check.run(CheckConfig(**SMALL, run=whole.run), resumed=Path(str(whole.run)))
     assert values(again) == values(whole) and time.process_time() - begun < 20.0
 
 
 def test_all_goes_through_every_control_on_three_scenes() -> None:
-    parts = checking.parts_of(CheckConfig(all=True))
+    parts = checking.list_parts(CheckConfig(all=True))
     assert [part.number for part in parts] == list(range(1, len(parts) + 1))
     assert {part.config.object for part in parts} == {"mug", "bowl", "bottle"} and len(parts) > 80
 
@@ -208,7 +211,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(INTERRUPTS, "count", 0)
     row = {"item": "tracing", "what": "tracing", "time_gain": 2.0, "seconds": 1.0, "safe": True}
     gain = GainRow.of({**row, "picture_difference": 0.0, "gradient_difference": 0.0})
-    monkeypatch.setattr(checking, "measured_gains", lambda *_, **__: [gain])
+    monkeypatch.setattr(checking, "measure_gains", lambda *_, **__: [gain])
     length = PathLength(depth=3, full=6, cuts=[], configurations=1, reason="few")
     monkeypatch.setattr(planning, "bounces_of", lambda *_, **__: length)
 

@@ -15,12 +15,12 @@ from advsearch import attack, load_scene
 from advsearch.attacks import Query
 from advsearch.cli.output import shown_text as text_of
 from advsearch.controls import CameraControl, LightControl, MaterialControl, TextureControl
-from advsearch.engine.gradients import inside, smooth_loss
-from advsearch.engine.planning import BOUND, measured_bounces
+from advsearch.engine.gradients import interior_point, smooth_loss
+from advsearch.engine.gradients.planning import BOUND, measured_bounces
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check import check
-from advsearch.questions.check.carry_out import ALL, WHAT, measured_gains, resolved_texels
+from advsearch.questions.check.leaving_out import ALL, WHAT, measure_gains, measure_texels
 from advsearch.questions.check.result import CheckConfig
 from advsearch.scene.formation import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer
@@ -35,7 +35,7 @@ def made(controls: Any, object: str = "mug", environment: str = "studio", denois
 @pytest.mark.parametrize("control", only(["texture"], ["texture", "haze"]))
 def test_nothing_that_is_left_out_changes_a_picture_or_a_gradient(control: str) -> None:
     renderer = made(control)
-    loss, u = smooth_loss((SIZE, SIZE)), inside(renderer)
+    loss, u = smooth_loss((SIZE, SIZE)), interior_point(renderer)
     full = renderer.like(renderer.scene.like(leave_out=NOTHING))
     with torch.no_grad():
         noise = (renderer(u, 100, 4) - renderer(u, 101, 4)).norm()
@@ -78,17 +78,17 @@ def test_putting_an_item_back_takes_effect(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.slow
 def test_gains_have_a_row_for_each_item_and_their_proof() -> None:
     renderer = made("texture")
-    rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=2, repeats=2, depth=4)
+    rows = measure_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=2, repeats=2, depth=4)
     assert [row.item for row in rows] == [*ITEMS, "bounces", ALL]
     assert {row.item for row in rows} == set(WHAT)
     assert all(row.time_gain > 0.0 and row.safe for row in rows)
 
 
 def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.questions.check.carry_out.ITEMS", {"tracing": ""})
-    monkeypatch.setattr("advsearch.questions.check.carry_out.NOTHING", EVERYTHING)
+    monkeypatch.setattr("advsearch.questions.check.leaving_out.ITEMS", {"tracing": ""})
+    monkeypatch.setattr("advsearch.questions.check.leaving_out.NOTHING", EVERYTHING)
     renderer = made("camera.exposure")
-    rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=128, repeats=2, depth=2)
+    rows = measure_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=128, repeats=2, depth=2)
     tracing, bounces, _ = rows
     assert tracing.picture_difference < 1e-5 and tracing.safe  # a recorded kernel rounds otherwise
     assert tracing.time_gain > 0.0
@@ -149,13 +149,13 @@ def test_a_long_search_says_what_paths_it_rendered() -> None:
 
 def test_texels_beyond_what_a_pixel_shows_are_counted() -> None:
     fine = made({"texture": {"resolution": 512}})
-    (found,) = resolved_texels(fine, fine.start, seed=0, spp=64)
+    (found,) = measure_texels(fine, fine.start, seed=0, spp=64)
     assert found.side == 512 and 0 < found.pixels < SIZE**2
     assert found.enough < 512 and found.seen > 4 * found.pixels
     coarse = made({"texture": {"resolution": 16}})
-    (found,) = resolved_texels(coarse, coarse.start, seed=0, spp=64)
+    (found,) = measure_texels(coarse, coarse.start, seed=0, spp=64)
     assert found.enough == found.side == 16
-    assert resolved_texels(made("light"), made("light").start, seed=0) == []
+    assert measure_texels(made("light"), made("light").start, seed=0) == []
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ from advsearch.questions.precision.benches import (
     gradient_parts,
     in_rounds,
 )
-from advsearch.questions.precision.carry_out import Measurement, recommended, timing_machine
+from advsearch.questions.precision.carry_out import Measurement, recommended
 from advsearch.questions.precision.result import (
     SAMPLERS,
     WARM_UP,
@@ -524,13 +524,6 @@ def test_settings_go_through_yaml_and_the_command_line(tmp_path: Path) -> None:
     shared = AttackConfig.of(config, norm="l2")
     assert (shared.object, shared.controls, shared.objective, shared.norm) == ("mug", {"pose": {}}, None, "l2")
     assert (shared.steps, shared.seconds) == (None, None), "what only has the same name is not shared"
-
-
-def test_the_machine_is_named(tmp_path: Path) -> None:
-    info = tmp_path / "cpuinfo"
-    info.write_text("processor : 0\nmodel name : An  Example CPU\n", encoding="utf-8")
-    assert timing_machine(info).cpu == "An Example CPU"
-    assert timing_machine(tmp_path / "none").cpu and timing_machine().cores >= 1
 
 
 def test_a_tiny_scene_from_end_to_end(

@@ -29,9 +29,10 @@ from advsearch.attacks import (
 from advsearch.attacks.candidates import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, scaled, smallest
 from advsearch.attacks.evaluation import Query
 from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
-from advsearch.engine import planning, surface_light
+from advsearch.engine import surface_light
 from advsearch.engine.bank import Bank
-from advsearch.engine.gradients import Bench, inside
+from advsearch.engine.gradients import planning
+from advsearch.engine.gradients.bench import Bench, interior_point
 from advsearch.engine.journal import PLAN, Journal, finite, other_numbers, same
 from advsearch.engine.judging import penalised
 from advsearch.engine.problem import Problem
@@ -123,9 +124,8 @@ class Attack:
             return  # derivatives will come from what predicts the pictures
         renderer, counted = problem.renderer, not full or config.deterministic
         seed = seeds.stream(problem.seed, "measure")
-        bench = Bench(
-            renderer, problem.loss, inside(renderer), seed, problem.spp, tick=lambda samples: progress.advance(1)
-        )
+        u, tick = interior_point(renderer), lambda samples: progress.advance(1)
+        bench = Bench(renderer, problem.loss, u, seed, problem.spp, tick=tick)
         gradients = planning.plan_gradients(renderer.plan, every=full)
         if gradients:
             hint = f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; `measure=no` leaves it out"

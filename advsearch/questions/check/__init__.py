@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from advsearch.experiment import RunContext, experiment, fail_check
+from advsearch.extend import RunContext, experiment, fail_check
 from advsearch.questions.check.result import CheckConfig, CheckResult, shown
 
 
@@ -17,8 +17,8 @@ from advsearch.questions.check.result import CheckConfig, CheckResult, shown
     exit_status=fail_check(lambda result: bool(result.falls_short)),
     view=shown,
 )
-def check(asked: RunContext[CheckConfig]) -> CheckResult:
+def check(context: RunContext[CheckConfig]) -> CheckResult:
     """Compare every gradient of a scene with differences, and plan a search over it (docs/gradients.md)."""
-    from advsearch.questions.check.carry_out import checked  # imports torch
+    from advsearch.questions.check.carry_out import GradientCheck  # imports torch
 
-    return checked(asked)
+    return GradientCheck(context).run()

@@ -7,20 +7,20 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from advsearch.config import DerivativeConfig, SceneConfig, TimedConfig
-from advsearch.report.shown import Column, InNotebook, ResultPart, ShownResult
-from advsearch.runs.results import (
-    OUT_OF_TIME,
+from advsearch.extend import (
+    Clash,
+    Column,
+    DerivativeConfig,
     Fields,
-    GroupDerivative,
-    JsonFloat,
-    Measured,
-    PathLength,
-    PlannedGradient,
+    InNotebook,
+    ResultPart,
     RunResult,
-    optional,
+    SceneConfig,
+    ShownResult,
+    results,
+    setting,
+    setting_as_in,
 )
-from advsearch.settings import Clash, setting, setting_as_in
 
 OF_ALL: Mapping[str, object] = {"object": "mug", "environment": None, "controls": {"texture": {}}, "set_": {}}
 """What is as it is unless it is given, and has to be left so with `all`."""
@@ -47,7 +47,15 @@ class CheckConfig(DerivativeConfig):
         "what is differentiated: a smooth linear loss of the raw picture, the model's own, or both in turn",
     )
     # fmt: on
-    seconds: float | None = setting_as_in(TimedConfig, "seconds")
+    seconds: float | None = setting(
+        None,
+        "check",
+        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
+        otherwise="no limit",
+        unit="seconds",
+        gt=0.0,
+        le=1e9,
+    )  # fmt: skip
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-check-NNN")
 
     @property
@@ -59,7 +67,7 @@ class CheckConfig(DerivativeConfig):
         return ("linear", "model") if self.loss == "both" else (self.loss,)
 
 
-class CheckedRow(Measured):
+class CheckedRow(results.Measured):
     """A derivative along a parameter, or the gradient of a whole control, beside its reference."""
 
     object: str
@@ -73,8 +81,8 @@ class GainRow(Fields):
     item: str
     what: str
     time_gain: float = Field(description="a gradient's time x the picture's variance with it, over those without it")
-    picture_difference: JsonFloat = Field(description="root mean square at one seed, over that of two seeds")
-    gradient_difference: JsonFloat = Field(description="the same of gradients; 0 where there are none")
+    picture_difference: results.JsonFloat = Field(description="root mean square at one seed, over that of two seeds")
+    gradient_difference: results.JsonFloat = Field(description="the same of gradients; 0 where there are none")
     safe: bool = Field(description="whether pictures and gradients agree to within their noise")
     seconds: float = Field(description="of a gradient with it")
 
@@ -89,7 +97,7 @@ class TexelRow(Fields):
     enough: int = Field(description="side, `side` halved as often as the pixels still resolve as much")
 
 
-class SearchPlan(PlannedGradient):
+class SearchPlan(results.PlannedGradient):
     """How a search over the scene gets its derivatives, and what it leaves out."""
 
     left_out: list[str] = Field(description="what is not computed at all, in sentences")
@@ -104,8 +112,8 @@ class CheckResult(InNotebook, RunResult):
     measured: int = Field(description="parts (a scene with a control and a loss) that are done")
     planned: int = Field(description="all parts")
     rows: list[CheckedRow]
-    plan: SearchPlan | None = optional("absent of `loss=linear` and of `all`")
-    bounces: PathLength | None = optional("how long the light paths of a long search are")
+    plan: SearchPlan | None = results.optional("absent of `loss=linear` and of `all`")
+    bounces: results.PathLength | None = results.optional("how long the light paths of a long search are")
     gains: list[GainRow] = Field(default=[], description="what is left out, and what that saves")
     texels: list[TexelRow] = Field(default=[], description="of the searched textures")
 
@@ -151,7 +159,7 @@ WHOLE: Mapping[str, Column] = {
 }
 
 
-def _step(group: GroupDerivative) -> str:
+def _step(group: results.GroupDerivative) -> str:
     if not group.step_reason:
         return ""
     unit = "" if group.unit == "1" else f" {group.unit}"
@@ -180,7 +188,7 @@ LOSSES = {
 def shown(result: CheckResult) -> ShownResult:
     rows, left, plan, sentences = result.rows, result.planned - result.measured, result.plan, []
     if left:
-        stopped = "The time was up" if result.ending == OUT_OF_TIME else "Stopped"
+        stopped = "The time was up" if result.ending == results.OUT_OF_TIME else "Stopped"
         sentences.append(
             f"{stopped} after {result.measured} of {result.planned} parts (a scene, its controls and a loss)."
         )

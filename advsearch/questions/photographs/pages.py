@@ -64,9 +64,7 @@ class PhotographPages:
         """
         sent = headers.get(KEY, "").encode("utf-8", "replace")
         if headers.get("Origin") is None or not hmac.compare_digest(key.encode(), sent):
-            raise Refused(
-                HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew"
-            )
+            raise Refused(HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew")
         with refused(HTTPStatus.NOT_FOUND):
             rendering_file(run, name)
         with refused(HTTPStatus.BAD_REQUEST):

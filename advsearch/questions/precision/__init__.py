@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from advsearch.experiment import RunContext, experiment
+from advsearch.extend import RunContext, experiment
 from advsearch.questions.precision.result import PrecisionConfig, PrecisionResult, shown
 
 
@@ -13,8 +13,8 @@ from advsearch.questions.precision.result import PrecisionConfig, PrecisionResul
     positional_args=("object", "model"),
     view=shown,
 )
-def precision(asked: RunContext[PrecisionConfig]) -> PrecisionResult:
+def precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
     """Measure error against run time of a scene and its gradients (docs/precision.md)."""
-    from advsearch.questions.precision.carry_out import measured  # imports torch
+    from advsearch.questions.precision.carry_out import measure_precision  # imports torch
 
-    return measured(asked)
+    return measure_precision(context)

@@ -14,12 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch import seeds
-from advsearch.engine.gradients import Bench, Estimate, Loss, Probe, agreement, only
+from advsearch.extend import gradients, seeds
 from advsearch.questions.precision.result import PrecisionReference
 from advsearch.questions.precision.rule import Array, Numbers, ReferenceValue, SampleSetting, reference_of
-from advsearch.scene.gradients import BY_ADJOINT, Group, compared
-from advsearch.scene.renderer import Renderer
 
 LEAST, COLD = 5, 2  # calls of a setting that have to fit into the budget for it to be begun; the first ones take longer
 CLAIM = 0.25  # share of the time left that one setting may lay claim to
@@ -149,7 +146,7 @@ class PictureBench:
     the model's margin on them with references. Pictures with and without denoiser have the same, margins their own."""
 
     def __init__(
-        self, renderer: Renderer, u: Tensor, margin: Callable[[Tensor], float], samplers: Sequence[str]
+        self, renderer: gradients.Renderer, u: Tensor, margin: Callable[[Tensor], float], samplers: Sequence[str]
     ) -> None:
         self._u, self._margin, self._space, self._formation = u, margin, renderer.space, renderer.formation
         self._lines = [*samplers, *(name + OIDN for name in ("independent", REFERENCE_SAMPLER) if name in samplers)]
@@ -220,33 +217,40 @@ class GradientPart:
     """Coordinates of one control whose gradient one call gives; named with parameters where a control has several."""
 
     name: str
-    groups: tuple[Group, ...]
+    groups: tuple[gradients.Group, ...]
     estimators: tuple[str, ...]
 
     @property
     def size(self) -> int:
         return sum(group.size for group in self.groups)
 
+    @property
+    def group_names(self) -> set[str]:
+        return {group.name for group in self.groups}
+
     def of(self, gradient: Tensor) -> Array:
         return flat(torch.cat([gradient[group.coordinates] for group in self.groups]))
 
+    def count_renders(self, estimator: str) -> int:
+        """Return the primal renders that one gradient by an estimator takes, beside the image itself."""
+        return sum(replace(group, estimator=estimator).renders for group in self.groups)
 
-def gradient_parts(groups: Sequence[Group], *, linear: bool) -> list[GradientPart]:
+
+def gradient_parts(groups: Sequence[gradients.Group], *, linear: bool) -> list[GradientPart]:
     """Return the parts of a space with the estimators that are valid for them. Of a linear loss, differences of the
     loss are those of the picture, and left out."""
-    sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
-    for group in groups:
-        if group.valid:
-            sets.setdefault((group.control, group.valid), []).append(group)
-    controls, parts = [control for control, _ in sets], []
-    for (control, valid), members in sets.items():
-        names = ",".join(group.parameter for group in members)
-        names = f"{members[0].parameter},... ({len(members)})" if len(names) > 28 else names
-        worth = compared(valid, sum(group.size for group in members))
-        estimators = tuple(name for name in worth if not (linear and name == "secant"))
-        parts.append(
-            GradientPart(f"{control}.{names}" if controls.count(control) > 1 else control, tuple(members), estimators)
-        )
+    sets = gradients.planning.comparable_sets(group for group in groups if group.valid)
+    controls = [members[0].control for members, _ in sets]
+    parts = []
+    for members, candidates in sets:
+        name = members[0].control
+        if controls.count(name) > 1:
+            parameters = ",".join(group.parameter for group in members)
+            if len(parameters) > 28:
+                parameters = f"{members[0].parameter},... ({len(members)})"
+            name = f"{name}.{parameters}"
+        estimators = tuple(estimator for estimator in candidates if not (linear and estimator == "secant"))
+        parts.append(GradientPart(name, members, estimators))
     return parts
 
 
@@ -254,44 +258,53 @@ class GradientBench:
     """Takes gradients (d,) of one part of a space at u by every estimator and compares them with a reference, which is
     taken with a better sampler: differences at two steps where the coordinates are few, else the mean of an adjoint."""
 
-    def __init__(self, renderer: Renderer, loss: Loss, u: Tensor, part: GradientPart) -> None:
+    def __init__(self, renderer: gradients.Renderer, loss: gradients.Loss, u: Tensor, part: GradientPart) -> None:
         self._renderer, self._loss, self._u, self.part = renderer, loss, u, part
         self._exact = renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
-        adjoints = [name for name in part.estimators if name in BY_ADJOINT]
-        self._by = "differences" if part.size <= BY_COORDINATE else (*adjoints, *part.estimators)[0]
+        self._by_differences = part.size <= BY_COORDINATE
+        adjoints = [name for name in part.estimators if name in ADJOINT_COST]
+        self._reference_estimator = "differences" if self._by_differences else (*adjoints, *part.estimators)[0]
         self.reference: ReferenceValue | None = None
         self.settings = list[SampleSetting]()
         for name in part.estimators:
-            cost = 1.0 + ADJOINT_COST.get(name, sum(replace(group, estimator=name).renders for group in part.groups))
+            cost = 1.0 + ADJOINT_COST.get(name, part.count_renders(name))
             for count in COUNTS["independent"]:
                 self.settings.append(SampleSetting("gradient", name, count, count * cost, part.name))
 
     def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> list[PrecisionReference]:
-        if self.part.size <= BY_COORDINATE:
-            along = []
-            for group in self.part.groups:
-                for place in range(group.begin, group.begin + group.size):
-                    direction = torch.zeros_like(self._u)
-                    direction[place] = 1.0
-                    alone, name = replace(group, size=1, begin=place), f"{group.name}.{place - group.begin}"
-                    along.append(Probe(alone, name, direction, group.step))
-
-            def both(noise: int, spp: int) -> Array:
-                """Of each coordinate the derivative, extrapolated to a step of zero, and how far two steps differ."""
-                of = partial(Bench(self._exact, self._loss, self._u, noise, spp).reference, repeats=(1, 1))
-                rows = [(found.value, found.steps[0] - found.steps[1]) for found in map(of, along)]
-                table: Array = np.array(rows, dtype=np.float64).T
-                return table
-
-            spp = part_samples(partial(both, 0), budget.left, parts=3, counts=(16, 64, 256))
-            parts = gather(partial(both, spp=spp), budget, on_done, seed)
-            bias = float(np.linalg.norm(np.mean([apart for _, apart in parts], axis=0))) / 4.0
-            self.reference = reference_of([values for values, _ in parts], bias=bias)
+        """Take the reference within a budget."""
+        if self._by_differences:
+            take = partial(self._take_derivatives, self._list_probes())
+            spp = part_samples(partial(take, 0), budget.left, parts=3, counts=(16, 64, 256))
+            parts = gather(partial(take, spp=spp), budget, on_done, seed)
+            bias = float(np.linalg.norm(np.mean([disagreement for _, disagreement in parts], axis=0))) / 4.0
+            self.reference = reference_of([derivatives for derivatives, _ in parts], bias=bias)
         else:
-            taken = partial(self._taken, self._exact, self._by)
-            spp = part_samples(partial(taken, 0), budget.left)
-            self.reference = reference_of(gather(partial(taken, spp=spp), budget, on_done, seed))
-        return [_row("gradient", self._by, self.reference, spp, self.part.name)]
+            take_gradient = partial(self._take_gradient, self._exact, self._reference_estimator)
+            spp = part_samples(partial(take_gradient, 0), budget.left)
+            self.reference = reference_of(gather(partial(take_gradient, spp=spp), budget, on_done, seed))
+        return [_row("gradient", self._reference_estimator, self.reference, spp, self.part.name)]
+
+    def _list_probes(self) -> list[gradients.Probe]:
+        """Return a probe along each coordinate of the part."""
+        probes = []
+        for group in self.part.groups:
+            for number in range(group.size):
+                index = group.begin + number
+                direction = torch.zeros_like(self._u)
+                direction[index] = 1.0
+                coordinate = replace(group, size=1, begin=index)
+                probes.append(gradients.Probe(coordinate, f"{group.name}.{number}", direction, group.step))
+        return probes
+
+    def _take_derivatives(self, probes: Sequence[gradients.Probe], noise: int, spp: int) -> Array:
+        """Return, (2, n), the derivative along each probe, extrapolated to a step of zero, and how far two steps
+        differ."""
+        bench = gradients.Bench(self._exact, self._loss, self._u, noise, spp)
+        references = [gradients.measure_reference(bench, probe, repeats=(1, 1)) for probe in probes]
+        pairs = [(reference.value, reference.steps[0] - reference.steps[1]) for reference in references]
+        table: Array = np.array(pairs, dtype=np.float64).T
+        return table
 
     def floor(self, setting: SampleSetting, quantity: str) -> float:
         return self.reference.error if self.reference else 0.0
@@ -299,30 +312,32 @@ class GradientBench:
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
         """Take one gradient; return how it compares, and its times, the picture itself included."""
         assert self.reference is not None
-        gradient, times = timed(partial(self._taken, self._renderer, setting.estimator, seed, setting.spp))
+        gradient, times = timed(partial(self._take_gradient, self._renderer, setting.estimator, seed, setting.spp))
         return {"gradient": {**self.reference.beside(gradient), **times}}
 
     def bias(self, seed: int) -> str | None:
         """Check a reference by an adjoint against differences along one direction; a sentence if it is biased."""
-        if self._by == "differences" or self.reference is None:
+        if self._reference_estimator == "differences" or self.reference is None:
             return None
         exact = self._exact
-        exact.plan = only(exact.plan, {group.name for group in self.part.groups}, self._by)
-        bench = Bench(exact, self._loss, self._u, seed, spp=64)
-        probe = bench.probes()[0]
-        against = bench.reference(probe, repeats=(2, 4))
-        own = float(self.reference.value @ self.part.of(probe.direction))
-        estimate = Estimate(self._by, own, self.reference.error * abs(own), 1, 0.0)
-        if agreement(estimate, against).status != "biased":
+        exact.plan = gradients.restrict_plan(exact.plan, self.part.group_names, self._reference_estimator)
+        bench = gradients.Bench(exact, self._loss, self._u, seed, spp=64)
+        probe = gradients.find_probes(bench)[0]
+        differences = gradients.measure_reference(bench, probe, repeats=(2, 4))
+        slope = float(self.reference.value @ self.part.of(probe.direction))
+        noise = self.reference.error * abs(slope)
+        estimate = gradients.Estimate(self._reference_estimator, slope, noise, repeats=1, seconds=0.0)
+        if gradients.compare_with_reference(estimate, differences).status != "biased":
             return None
         return (
-            f"{self.part.name}: the reference is the mean of {self._by}, and along one direction it gives {own:.3g}, "
-            f"differences {against.value:.3g} +- {against.noise:.1g}: its errors leave out that bias"
+            f"{self.part.name}: the reference is the mean of {self._reference_estimator}, and along one direction it "
+            f"gives {slope:.3g}, differences {differences.value:.3g} +- {differences.noise:.1g}: its errors leave out "
+            "that bias"
         )
 
-    def _taken(self, renderer: Renderer, estimator: str, seed: int, spp: int) -> Array:
-        plan = only(renderer.plan, {group.name for group in self.part.groups}, estimator)
-        return self.part.of(Bench(renderer, self._loss, self._u, seed, spp).gradient(plan, seed))
+    def _take_gradient(self, renderer: gradients.Renderer, estimator: str, seed: int, spp: int) -> Array:
+        plan = gradients.restrict_plan(renderer.plan, self.part.group_names, estimator)
+        return self.part.of(gradients.Bench(renderer, self._loss, self._u, seed, spp).gradient(plan, seed))
 
 
 def _row(quantity: str, name: str, value: ReferenceValue, spp: int, control: str = "") -> PrecisionReference:

@@ -8,11 +8,22 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
-from advsearch.config import DerivativeConfig, SceneConfig
-from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn
-from advsearch.report.shown import Column, ResultPart, ShownResult
-from advsearch.runs.results import Fields, Formation, Interval, JsonFloat, Measured, RunResult, optional
-from advsearch.settings import Clash, check_once, setting, setting_as_in, split_names
+from advsearch.extend import (
+    Clash,
+    Column,
+    DerivativeConfig,
+    Fields,
+    Interval,
+    ResultPart,
+    RunResult,
+    SceneConfig,
+    ShownResult,
+    figures,
+    results,
+    setting,
+    setting_as_in,
+    settings,
+)
 
 QUANTITIES = ("image", "gradient")
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
@@ -26,9 +37,9 @@ class PrecisionConfig(DerivativeConfig):
     command: ClassVar[str] = "precision"
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
-        Clash("samplers", lambda config: "image" not in split_names(config.quantities),
+        Clash("samplers", lambda config: "image" not in config.measured_quantities,
               "is of the image, which `quantities` leaves out; leave it out too"),
-        Clash("loss", lambda config: "gradient" not in split_names(config.quantities),
+        Clash("loss", lambda config: "gradient" not in config.measured_quantities,
               "is of the gradient, which `quantities` leaves out; leave it out too"),
     )
 
@@ -57,18 +68,27 @@ class PrecisionConfig(DerivativeConfig):
     @classmethod
     def _several(cls, value: str, info: Any) -> str:
         """Refuse lists with nothing in them, with something twice, and with names that are not known."""
-        names, known = split_names(value), QUANTITIES if info.field_name == "quantities" else SAMPLERS
+        names = settings.split_names(value)
+        known = QUANTITIES if info.field_name == "quantities" else SAMPLERS
         if not "".join(names).strip() or not set(names) <= set(known):
             raise ValueError("nothing, or unknown names")
-        check_once(names, info.field_name)
+        settings.check_once(names, info.field_name)
         return value
 
     @property
     def title(self) -> tuple[str, ...]:
         return self.object, self.command
 
+    @property
+    def measured_quantities(self) -> tuple[str, ...]:
+        return settings.split_names(self.quantities)
 
-class PrecisionPoint(Measured):
+    @property
+    def compared_samplers(self) -> tuple[str, ...]:
+        return settings.split_names(self.samplers)
+
+
+class PrecisionPoint(results.Measured):
     """What repeated measurements of one setting say."""
 
     family: str = Field(
@@ -76,7 +96,7 @@ class PrecisionPoint(Measured):
         description="what it is recommended among: `raw`, `oidn`, `depth` or `predicted`; absent of gradients",
     )
     heavy_tailed: bool = Field(default=False, description="a few pixels hold the error, so that it has no interval")
-    wall_seconds: JsonFloat | None = optional("by the clock; `seconds` are processor time")
+    wall_seconds: results.JsonFloat | None = results.optional("by the clock; `seconds` are processor time")
 
     @property
     def known(self) -> bool:
@@ -110,7 +130,7 @@ class PrecisionReference(Fields):
     quantity: str
     control: str = ""
     reference: str
-    error: JsonFloat
+    error: results.JsonFloat
     parts: int
     spp: int = Field(description="samples a pixel of all parts together")
 
@@ -122,12 +142,12 @@ class Recommended(Fields):
     control: str
     family: str = ""
     goal: float | None = None
-    estimator: str | None = optional("null where nothing that was measured reaches it")
+    estimator: str | None = results.optional("null where nothing that was measured reaches it")
     spp: int | None = None
-    seconds: JsonFloat | None = None
-    error: JsonFloat | None = None
-    basis: str | None = optional("measured, fitted, interpolated, extrapolated or confirmed")
-    repeats: int | None = optional("measurements that confirm it")
+    seconds: results.JsonFloat | None = None
+    error: results.JsonFloat | None = None
+    basis: str | None = results.optional("measured, fitted, interpolated, extrapolated or confirmed")
+    repeats: int | None = results.optional("measurements that confirm it")
 
 
 class Sitting(Fields):
@@ -156,7 +176,7 @@ class PrecisionResult(RunResult):
 
     object: str
     model: str
-    image_formation: Formation
+    image_formation: results.Formation
     depth: int = Field(description="longest light path in segments")
     loss: str
     spp: int
@@ -285,14 +305,16 @@ def _between(interval: Interval | None) -> str:
     return "" if interval is None else f"{100 * interval[0]:.2g} to {100 * interval[1]:.2g}"
 
 
-COLORS = (BLUE, "#b4540a", "#1f7a45", "#7a3fa8", RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f", "#3f5fd0", "#a06a50")
+GREY = figures.GREY
+COLORS = (figures.BLUE, "#b4540a", "#1f7a45", "#7a3fa8", figures.RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f", "#3f5fd0",
+          "#a06a50")  # fmt: skip
 MARKERS = "osD^vP*X<>d"
 PANEL = (5.6, 3.9)  # width and height of one diagram in inches
 PERCENT = 100.0
 MINUS = "\N{MINUS SIGN}"
 
 
-def precision_figures(result: PrecisionResult) -> Figures:
+def precision_figures(result: PrecisionResult) -> figures.Figures:
     """Return work-precision diagrams as files: error against seconds, both logarithmic; none where nothing is known.
 
     Filled markers are known errors; open ones with an arrow are limits: the reference is no better than that. The
@@ -327,7 +349,7 @@ def precision_figures(result: PrecisionResult) -> Figures:
         figure.suptitle(what, fontsize=11, fontweight="bold", x=0.01, ha="left")
         figure.supxlabel(below, fontsize=8, color=GREY, x=0.01, ha="left")
 
-    return drawn(draw, (PANEL[0] * wide, PANEL[1] * tall + 0.8))
+    return figures.drawn(draw, (PANEL[0] * wide, PANEL[1] * tall + 0.8))
 
 
 def _draw_errors(axes: Any, points: Sequence[PrecisionPoint], result: PrecisionResult) -> None:

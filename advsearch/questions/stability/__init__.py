@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from advsearch.experiment import RunContext, experiment, fail_check
+from advsearch.extend import RunContext, experiment, fail_check
 from advsearch.questions.stability.result import StabilityConfig, StabilityResult, shown
 
 
@@ -16,8 +16,8 @@ from advsearch.questions.stability.result import StabilityConfig, StabilityResul
     exit_status=fail_check(lambda result: any(row.status != "ok" for row in result.rows)),
     view=shown,
 )
-def stability(asked: RunContext[StabilityConfig]) -> StabilityResult:
+def stability(context: RunContext[StabilityConfig]) -> StabilityResult:
     """Try stiff and extreme scenes, and say whether each of them holds (docs/stability.md)."""
-    from advsearch.questions.stability.scenes import tried_cases  # imports torch
+    from advsearch.questions.stability.scenes import run_cases  # imports torch
 
-    return tried_cases(asked)
+    return run_cases(context)

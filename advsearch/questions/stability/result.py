@@ -12,11 +12,21 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
-from advsearch.config import SceneConfig, TimedConfig
-from advsearch.errors import AdvsearchError
-from advsearch.report.shown import Column, InNotebook, ResultPart, ShownResult
-from advsearch.runs.results import Fields, JsonFloat, Result, having
-from advsearch.settings import Clash, Config, each_once, setting, setting_as_in, split_names, texts
+from advsearch.extend import (
+    Clash,
+    Column,
+    Config,
+    Fields,
+    InNotebook,
+    InputError,
+    ResultPart,
+    SceneConfig,
+    ShownResult,
+    results,
+    setting,
+    setting_as_in,
+    settings,
+)
 
 
 class StabilityConfig(Config):
@@ -32,20 +42,24 @@ class StabilityConfig(Config):
     group: str | None = setting(
         None, "check", "groups of cases to try, separated by commas", "names of groups", otherwise="all", form="names"
     )
-    seconds: float | None = setting_as_in(TimedConfig, "seconds")
+    seconds: float | None = setting(
+        None, "check",
+        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
+        otherwise="no limit", unit="seconds", gt=0.0, le=1e9,
+    )  # fmt: skip
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/stability-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    _named = texts("run", several=["case", "group"])
-    _different = each_once("case", "group")
+    _named = settings.texts("run", several=["case", "group"])
+    _different = settings.each_once("case", "group")
 
     @property
     def cases(self) -> tuple[str, ...]:
-        return () if self.case is None else split_names(self.case)
+        return () if self.case is None else settings.split_names(self.case)
 
     @property
     def groups(self) -> tuple[str, ...]:
-        return () if self.group is None else split_names(self.group)
+        return () if self.group is None else settings.split_names(self.group)
 
 
 OK, FELL_SHORT = "ok", "fell short"
@@ -55,7 +69,7 @@ class Check(Fields):
     """One number that decides, and the range that it has to be in, both ends included; null where there is no end."""
 
     what: str
-    value: JsonFloat
+    value: results.JsonFloat
     least: float | None
     most: float | None
     ok: bool
@@ -87,16 +101,16 @@ class CaseRow(Fields):
     status: str = Field(description="`ok` or `fell short`")
     decides: str = Field(description="the number that decides")
     finite: bool = Field(description="every picture and gradient was finite, and none had to be made so")
-    relative_error: JsonFloat | None = Field(
+    relative_error: results.JsonFloat | None = Field(
         description="of a gradient against its reference; null where there is none"
     )
     ending: str = Field(description="of the case's search; `refused` where its input was")
     checks: list[Check]
-    measured: dict[str, JsonFloat] = Field(description="further numbers, such as condition numbers and biases")
+    measured: dict[str, results.JsonFloat] = Field(description="further numbers, such as condition numbers and biases")
     seconds: float = Field(description="what the case took")
 
 
-class StabilityResult(InNotebook, Result):
+class StabilityResult(InNotebook, results.Result):
     """Extreme cases, and whether each of them holds."""
 
     command: ClassVar[str] = "stability"
@@ -105,7 +119,9 @@ class StabilityResult(InNotebook, Result):
     ending: str = Field(description="`done`, `interrupted` or `out of time`")
     rows: list[CaseRow]
     not_run: list[str] = Field(description="cases that were not begun")
-    seconds: Annotated[dict[str, JsonFloat], having("total")] = Field(description="in `total`, of this sitting")
+    seconds: Annotated[dict[str, results.JsonFloat], results.having("total")] = Field(
+        description="in `total`, of this sitting"
+    )
     command_line: str = Field(description="that asks the same again")
 
     @property
@@ -176,7 +192,7 @@ class Case:
         begun = time.perf_counter()
         try:
             outcome = self.find()
-        except AdvsearchError as error:
+        except InputError as error:
             outcome = Outcome([check(f"refused: {error}", 1.0, 0.0, 0.0)], ending="refused")
         except Exception as error:
             what = f"raised {type(error).__name__}: {error}"

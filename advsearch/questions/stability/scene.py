@@ -7,26 +7,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Domain, Evaluation, Policy, Query, SearchResult, search
-from advsearch.controls import Space, make_control, make_space
-from advsearch.engine import judging
-from advsearch.engine.gradients import Bench, Loss, smooth_loss
+from advsearch.extend import Domain, Evaluation, Policy, SceneDescription, assets, gradients, results, workbench
 from advsearch.questions.stability.result import Outcome, check, holds
-from advsearch.runs.results import Measured
-from advsearch.scene import library
-from advsearch.scene.assembly import Motion
-from advsearch.scene.assets import EnvironmentAsset, Floats, Material, Mesh, ObjectAsset
-from advsearch.scene.description import describe
-from advsearch.scene.formation import ImageFormation
-from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.parts import ScenePart
-from advsearch.scene.renderer import Renderer
 
 SIZE = 24  # side of the pictures in pixels
 SPP = 8  # samples a pixel of a picture and of a working gradient
@@ -36,72 +25,74 @@ DOUBT = 0.4  # the noise of a comparison, as a share of the derivative, from whi
 SHARPNESS = 20.0  # logits per unit of the linear loss that the searched model returns
 SAME_PICTURE = 2e-3  # mean difference of two pictures that should be one: an 8-bit level is 4e-3
 ControlSettings = Mapping[str, Mapping[str, object]]
-Thing = str | Path | ObjectAsset | Callable[[], ObjectAsset]
+Thing = str | Path | assets.ObjectAsset | Callable[[], assets.ObjectAsset]
 """What a scene shows; a function makes it when the case runs."""
 
 
 def small(
-    controls: ControlSettings, thing: Thing = "mug", *, environment: str | Path | EnvironmentAsset | None = None,
-    settings: Mapping[str, float] | None = None, parts: Sequence[ScenePart] = (), denoise: str = "none",
-) -> Renderer:  # fmt: skip
-    """Return `render(u, seed, spp)` of a small picture: as `Scene.renderer`, with parts of our own.
+    controls: ControlSettings, thing: Thing = "mug", *,
+    environment: str | Path | assets.EnvironmentAsset | None = None, settings: Mapping[str, float] | None = None,
+    plugins: Mapping[str, Mapping[str, object]] = MappingProxyType({}), denoise: str = "none",
+) -> gradients.Renderer:  # fmt: skip
+    """Return `render(u, seed, spp)` of a small image: as `Scene.renderer`, with further shapes in Mitsuba's words.
 
     Its differences are taken over a pixel: the losses of these cases are smooth.
     """
-    shown = thing() if callable(thing) else thing
-    description = describe(shown, environment or plain_environment(), given=settings)
-    for part in parts:
-        description = description.with_part(part)
-    space = make_space([make_control(name, given) for name, given in controls.items()], description)
-    description = space.scene or description
-    formation = ImageFormation(denoiser=denoise, resolution=(SIZE, SIZE), gain=description.gain)
-    scene = MitsubaScene(description, (SIZE, SIZE), filter=formation.filter)
-    renderer = Renderer(scene, space, formation, 0, motion=Motion(description, (SIZE, SIZE), scene.assembly))
+    shape = thing() if callable(thing) else thing
+    scene = workbench.load_scene(shape, environment or plain_environment(), settings=settings)
+    description = scene.description
+    for name, plugin in plugins.items():
+        description = description.with_part(workbench.PluginPart(name, plugin))
+    renderer = replace(scene, description=description).renderer(controls, resolution=SIZE, denoise=denoise)
     renderer.plan = renderer.plan.at_a_pixel()
     return renderer
 
 
-def plain_environment() -> EnvironmentAsset:
+def describe_mug() -> SceneDescription:
+    return workbench.load_scene("mug").description
+
+
+def plain_environment() -> assets.EnvironmentAsset:
     """Return a sky brighter on one side and above, (16, 32, 3), so that turning it changes something."""
     rows, columns = np.mgrid[0:16, 0:32].astype(np.float32)
     light = 0.4 * (1.0 + 0.6 * np.sin(columns * (2.0 * np.pi / 32.0)) + 0.8 * np.cos(rows * (np.pi / 16.0)))
-    return EnvironmentAsset("plain", np.repeat(light[:, :, None], 3, axis=2).clip(0.05).astype(np.float32))
+    return assets.EnvironmentAsset("plain", np.repeat(light[:, :, None], 3, axis=2).clip(0.05).astype(np.float32))
 
 
-def grey_map(value: float, texel: float | None = None) -> EnvironmentAsset:
-    radiance: Floats = np.full((16, 32, 3), value, np.float32)
+def grey_map(value: float, texel: float | None = None) -> assets.EnvironmentAsset:
+    radiance: assets.Floats = np.full((16, 32, 3), value, np.float32)
     if texel is not None:
         radiance[4, 10] = texel
-    return EnvironmentAsset("made", radiance)
+    return assets.EnvironmentAsset("made", radiance)
 
 
-def mesh_of(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]) -> Mesh:
+def mesh_of(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]) -> assets.Mesh:
     """Return a mesh with UVs from x and z, whose normals face +x."""
     points = np.asarray(vertices, np.float32)
     facing = np.tile([1.0, 0.0, 0.0], (len(points), 1))
     low, high = points.min(axis=0), points.max(axis=0)
     uvs = ((points - low) / np.maximum(high - low, 1e-12))[:, 1:]
-    return Mesh(points, np.asarray(faces, np.uint32), facing.astype(np.float32), uvs.astype(np.float32))
+    return assets.Mesh(points, np.asarray(faces, np.uint32), facing.astype(np.float32), uvs.astype(np.float32))
 
 
-def checked(mesh: Mesh) -> ObjectAsset:
+def checked(mesh: assets.Mesh) -> assets.ObjectAsset:
     """Return an object with a checked texture around a display-referred grey."""
     checks = np.indices((4, 4)).sum(axis=0) % 2
     base = np.float32(0.5) + np.float32(0.3) * (checks - np.float32(0.5))
     texels = np.repeat(base[:, :, None], 3, axis=2).clip(0.0, 1.0).astype(np.float32)
-    return ObjectAsset("thing", mesh, texels, Material())
+    return assets.ObjectAsset("thing", mesh, texels, assets.Material())
 
 
-def painted(texels: np.ndarray) -> ObjectAsset:
+def painted(texels: np.ndarray) -> assets.ObjectAsset:
     grey = np.repeat(texels[:, :, None], 3, axis=2).astype(np.float32)
-    return replace(library.load_object("mug"), name="painted", base_color=grey)
+    return replace(describe_mug().object, name="painted", base_color=grey)
 
 
-def black_and_white() -> ObjectAsset:
+def black_and_white() -> assets.ObjectAsset:
     return painted(np.indices((8, 8)).sum(axis=0) % 2)
 
 
-def dark() -> ObjectAsset:
+def dark() -> assets.ObjectAsset:
     """Return the mug in black: what moves in the picture is its outline and nothing else, so little noise."""
     return painted(np.full((4, 4), 0.02))
 
@@ -129,7 +120,7 @@ def seen(
     at = renderer.start.clone()
     for index, value in u.items() if isinstance(u, Mapping) else enumerate(u or ()):
         at[index] = value
-    loss = smooth_loss(renderer.formation.resolution)
+    loss = gradients.smooth_loss(renderer.formation.resolution)
     picture = shown(renderer, at, 0, spp)
     _, slope = renderer.gradient(loss, at, 0, spp)
     finite = bool(torch.isfinite(picture).all()) and bool(torch.isfinite(slope).all())
@@ -164,30 +155,35 @@ def seen(
     return Outcome(checks, finite, worst.bias if worst else None, result.ending.value, measured)
 
 
-def shown(renderer: Renderer, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
+def shown(renderer: gradients.Renderer, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
     with torch.no_grad():
         return renderer(u, seed, spp)
 
 
 def compared(
-    renderer: Renderer, u: Tensor, *, spp: int = SPP, seeds: tuple[int, int] = (3, 12), repeats: int = 24
-) -> list[Measured]:
+    renderer: gradients.Renderer, u: Tensor, *, spp: int = SPP, seeds: tuple[int, int] = (3, 12), repeats: int = 24
+) -> list[results.Measured]:
     """Compare the plan's own gradient with common-random-number differences, of a linear loss of the raw picture."""
-    before, many = renderer.formation, (repeats, repeats)
+    before = renderer.formation
     renderer.formation = replace(before, transfer="linear")
     try:
-        bench = Bench(renderer, smooth_loss(before.resolution), u, seed=1, spp=spp)
-        return list(bench.derivatives(reference_spp=REFERENCE_SPP, seeds_of_reference=seeds, repeats=many))
+        bench = gradients.Bench(renderer, gradients.smooth_loss(before.resolution), u, seed=1, spp=spp)
+        rows = gradients.measure_derivatives(
+            bench, reference_spp=REFERENCE_SPP, seeds_of_reference=seeds, repeats=(repeats, repeats)
+        )
+        return list(rows)
     finally:
         renderer.formation = before
 
 
-def inward(renderer: Renderer, slope: Tensor, of: Tensor | float, seeds: int, spp: int) -> tuple[float, float]:
+def inward(
+    renderer: gradients.Renderer, slope: Tensor, of: Tensor | float, seeds: int, spp: int
+) -> tuple[float, float]:
     """Return the derivative of the smooth linear loss of the raw picture as numbers go inwards from the start that
     raise it so, where `of` is 1: by a gradient (d,), and by one-sided differences of second order, since there is no
     other side at a bound."""
     raw, u, step = renderer.like(transfer="linear"), renderer.start, 0.04
-    loss = smooth_loss(raw.formation.resolution)
+    loss = gradients.smooth_loss(raw.formation.resolution)
     direction = torch.where(u > 0.5, -1.0, 1.0) * (slope * (0.5 - u) > 0.0) * of
     wanted = []
     for seed in range(seeds):
@@ -196,7 +192,7 @@ def inward(renderer: Renderer, slope: Tensor, of: Tensor | float, seeds: int, sp
     return float(slope @ direction), math.fsum(wanted) / seeds
 
 
-def evaluated(renderer: Renderer, loss: Loss, spp: int, query: Query) -> Evaluation:
+def evaluated(renderer: gradients.Renderer, loss: gradients.Loss, spp: int, query: workbench.Query) -> Evaluation:
     """Evaluate a configuration by a loss of the picture; over 0 is a success."""
     u, seed, spp, derivative = query.u, query.number, spp * query.samples, None
     bad, renders = renderer.non_finite, renderer.renders
@@ -209,16 +205,16 @@ def evaluated(renderer: Renderer, loss: Loss, spp: int, query: Query) -> Evaluat
 
 
 def searched(
-    renderer: Renderer, loss: Loss, steps: int, *, spp: int = SPP, start: Tensor | None = None,
+    renderer: gradients.Renderer, loss: gradients.Loss, steps: int, *, spp: int = SPP, start: Tensor | None = None,
     policy: Policy[Any] | None = None, **more: Any,
-) -> SearchResult:  # fmt: skip
+) -> workbench.SearchResult:  # fmt: skip
     """Search for a picture of a loss over 0."""
     evaluate, domain = partial(evaluated, renderer, loss, spp), search_domain(renderer, start)
-    return search(partial(map, evaluate), domain, policy or PGD(), steps=steps, seed=0, **{"candidates": 0, **more})
+    policy = policy or workbench.make_policy("pgd")
+    return workbench.search(partial(map, evaluate), domain, policy, steps=steps, seed=0, **{"candidates": 0, **more})
 
 
-def search_domain(renderer: Renderer, start: Tensor | None = None) -> Domain:
-    space = renderer.space
-    assert isinstance(space, Space)
-    u, cost = renderer.start if start is None else start, renderer.plan.renders
-    return judging.domain_of(space.controls, u, gradient_cost=cost, partial_gradients=True)
+def search_domain(renderer: gradients.Renderer, start: Tensor | None = None) -> Domain:
+    space: Any = renderer.space  # of controls, since `small` made it
+    start = renderer.start if start is None else start
+    return workbench.domain_of(space.controls, start, gradient_cost=renderer.plan.renders, partial_gradients=True)

@@ -6,7 +6,6 @@ import math
 import statistics
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -15,12 +14,7 @@ import OpenEXR
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Adam, Auto, Query
-from advsearch.controls.support.meshes import sphere
-from advsearch.engine.gradients import smooth_loss
-from advsearch.engine.record import Results, taken_rows
-from advsearch.errors import InputError, UnknownNameError
-from advsearch.experiment import RunContext
+from advsearch.extend import InputError, RunContext, UnknownNameError, assets, geometry, gradients, workbench
 from advsearch.questions.stability.result import (
     CASES,
     Case,
@@ -44,6 +38,7 @@ from advsearch.questions.stability.scene import (
     checked,
     compared,
     dark,
+    describe_mug,
     evaluated,
     grey_map,
     inward,
@@ -54,13 +49,6 @@ from advsearch.questions.stability.scene import (
     shown,
     small,
 )
-from advsearch.scene.assets import EnvironmentAsset, ObjectAsset, normalised
-from advsearch.scene.description import describe
-from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.importing.objects import import_object
-from advsearch.scene.library import import_environment
-from advsearch.scene.mitsuba_backend.parts import Translation, translation
-from advsearch.scene.parts import ScenePart
 
 BRIGHT = 1e5
 PLATEAU_STEPS = 40  # evaluations in which a search has to be off a plateau
@@ -108,9 +96,9 @@ def refused_texel(value: float, as_file: bool) -> Outcome:
                 path = Path(folder) / "bad.exr"
                 with OpenEXR.File({}, {"RGB": radiance}) as picture:
                     picture.write(str(path))
-                import_environment(path)
+                workbench.load_scene("mug", path)
         else:
-            renderer = small(TEXTURE, environment=EnvironmentAsset("made", radiance))
+            renderer = small(TEXTURE, environment=assets.EnvironmentAsset("made", radiance))
             shown(renderer, renderer.start, 0, 1)
     except InputError as error:
         counted = "texels" in str(error) and "\n" not in str(error)
@@ -134,12 +122,12 @@ def plateau(low: float, high: float) -> Outcome:
     renderer = small({"camera": {"exposure": [low, high]}})
     start, checks, endings, flat = torch.ones_like(renderer.start), [], [], 0
     loss = lambda image: 0.9 - image.mean()  # noqa: E731
-    for policy in (PGD(), Adam(), Auto()):
+    for policy in map(workbench.make_policy, ("pgd", "adam", "auto")):
         result = searched(renderer, loss, PLATEAU_STEPS, spp=2, start=start, policy=policy)
         flat += sum(record.gradient_norm == 0.0 for record in result.history)
         checks.append(holds(f"{policy.name} finds a picture that is not white", result.best_objective > 0.0))
         endings.append(f"{policy.name}: {result.ending.value}")
-    slope = evaluated(renderer, loss, 2, Query(start, 0, gradient=True)).gradient
+    slope = evaluated(renderer, loss, 2, workbench.Query(start, 0, gradient=True)).gradient
     assert slope is not None
     at_first = check("gradient at the start", float(slope.abs().max()), 0.0, 0.0)
     measured = {"evaluations without a gradient": float(flat)}
@@ -156,24 +144,12 @@ cases("radiometric", plateau, [
 # ---- surfaces -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class GlassBall(ScenePart):
-    """A ball of clear glass, in object sizes; nothing of it varies."""
-
-    place: tuple[float, float, float]
-    radius: float
-
-
-@translation.register
-def _glass(part: GlassBall) -> Translation:
-    surface = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
-    ball = {"type": "sphere", "center": list(part.place), "radius": part.radius, "bsdf": surface}
-    return Translation({part.name: ball})
-
-
-def glass() -> GlassBall:
-    x, y, z = (float(value) for value in camera_to_world(describe("mug"))[:3, 3] * 0.6 + np.array([0.0, 0.0, 0.2]))
-    return GlassBall("glass", (x, y, z), 0.3)
+def glass() -> dict[str, dict[str, object]]:
+    """Return a ball of clear glass before the mug, by name, in Mitsuba's words; nothing of it varies."""
+    camera = geometry.camera_to_world(describe_mug())[:3, 3]
+    center = [float(value) for value in camera * 0.6 + np.array([0.0, 0.0, 0.2])]
+    material = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
+    return {"glass": {"type": "sphere", "center": center, "radius": 0.3, "bsdf": material}}
 
 
 def surface(searched: tuple[str, ...], slow: bool = True, **values: float) -> dict[str, object]:
@@ -197,7 +173,7 @@ cases("materials", seen, [
 def clear_glass() -> Outcome:
     """A texel behind clear glass has the right gradient, and nothing is NaN."""
     controls: ControlSettings = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}}
-    return seen(controls, parts=[glass()], beside={}, apart=(0.01, None))
+    return seen(controls, plugins=glass(), beside={}, apart=(0.01, None))
 
 
 @case("materials", "texels-0-and-1")
@@ -206,7 +182,7 @@ def texels_at_the_ends() -> Outcome:
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
     renderer = small(controls, black_and_white)
     raw, start = renderer.like(transfer="linear"), renderer.start
-    loss = smooth_loss(raw.formation.resolution)
+    loss = gradients.smooth_loss(raw.formation.resolution)
     slope = torch.stack([raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]).mean(dim=0)
     gradient, wanted = inward(renderer, slope, 1.0, 8, REFERENCE_SPP)
     error = abs(gradient / wanted - 1.0)
@@ -255,8 +231,8 @@ cases("light", seen, [
 @case("light", "projector-through-glass")
 def through_glass() -> Outcome:
     """Light that meets glass on its way leaves picture and gradient finite."""
-    along = thrown(azimuth=describe("mug").number("camera.azimuth"))
-    return seen(**along, parts=[glass()])  # type: ignore[arg-type]
+    along = thrown(azimuth=describe_mug().number("camera.azimuth"))
+    return seen(**along, plugins=glass())  # type: ignore[arg-type]
 
 
 # ---- meshes, places and views ---------------------------------------------------------------------------------------
@@ -275,12 +251,12 @@ SHIFT: ControlSettings = {"pose": {"x": [-0.3, 0.3]}}
 BARE = {"ground.size": 0.0}  # settings without the ground, so that a dark object has an outline and nothing else
 
 
-def mesh(thing: ObjectAsset, beside: ObjectAsset | None = None) -> dict[str, object]:
+def mesh(thing: assets.ObjectAsset, beside: assets.ObjectAsset | None = None) -> dict[str, object]:
     like = {"beside": {"thing": beside, "settings": FRONT}} if beside else {}
     return {"controls": PAINTED, "thing": thing, "settings": FRONT, "slow": True, **like}
 
 
-def box_in_a_file(scale: float = 1.0, shift: float = 0.0) -> ObjectAsset:
+def box_in_a_file(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
     """A box as a file gives it, in some unit and at some distance from the file's origin."""
     points = np.array([[x, y, z] for x in (-0.3, 0.3) for y in (-0.5, 0.5) for z in (0.0, 1.0)]) * scale + shift
     corners = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]]
@@ -290,7 +266,7 @@ def box_in_a_file(scale: float = 1.0, shift: float = 0.0) -> ObjectAsset:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "box.obj"
         path.write_text("\n".join(lines) + "\n")
-        return import_object(path)
+        return workbench.load_scene(path).description.object
 
 
 def from_a_file(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
@@ -332,9 +308,9 @@ cases("geometry", seen, [
 @case("geometry", "million-triangles", slow=True)
 def million() -> Outcome:
     """Finite, right, and like the coarse mesh of the same shape."""
-    fine, rough = (normalised(sphere(*counts)) for counts in ((501, 1000), (64, 128)))
+    fine, rough = (assets.normalised(workbench.sphere(*counts)) for counts in ((501, 1000), (64, 128)))
     coarse, renderer = (small(SHIFT, checked(made)) for made in (rough, fine))
-    _, slope = renderer.gradient(smooth_loss(renderer.formation.resolution), renderer.start, 0, SPP)
+    _, slope = renderer.gradient(gradients.smooth_loss(renderer.formation.resolution), renderer.start, 0, SPP)
     apart = float((shown(renderer, renderer.start, 0, 64) - shown(coarse, coarse.start, 0, 64)).abs().mean())
     return seen(TEXTURE, checked(fine), evaluations=2).also(
         check("triangles", float(len(fine.faces)), least=1e6),
@@ -361,7 +337,7 @@ def full_turn(controls: ControlSettings) -> Outcome:
     """0 and 360 degrees are one place: one picture, one gradient, and a step across the seam goes on."""
     renderer = small(controls)
     zero, one = torch.zeros_like(renderer.start), torch.ones_like(renderer.start)
-    loss = smooth_loss(renderer.formation.resolution)
+    loss = gradients.smooth_loss(renderer.formation.resolution)
     slopes = [renderer.gradient(loss, u, 0, SPP)[1] for u in (zero, one)]
     apart = float((shown(renderer, zero) - shown(renderer, one)).abs().mean())
     wrapped = float(search_domain(renderer).project(one + 0.01).max())
@@ -382,29 +358,30 @@ for control, name in (("pose", "yaw"), ("camera", "azimuth"), ("environment", "r
 # ---- `stability`: stiff and extreme scenes, and whether each of them holds ------------------------------------------
 
 
-def tried_cases(asked: RunContext[StabilityConfig]) -> StabilityResult:
+def run_cases(context: RunContext[StabilityConfig]) -> StabilityResult:
     """Run cases of the suite one after the other, until they are done, the time is up or there is an interrupt.
 
     A case that is done is stored at once: a run that was stopped goes on with the case that it was at.
     """
-    cases, progress = chosen(asked.config.cases, asked.config.groups), asked.progress
-    results = Results(asked.run, asked.config.seconds)
+    cases = chosen(context.config.cases, context.config.groups)
+    measurements = context.open_measurements(context.config.seconds)
+    progress = context.progress
 
-    def rows() -> Iterator[CaseRow]:
+    def measure_rows() -> Iterator[CaseRow]:
         hint = "`case` and `group` pick some, `seconds` stops before the next one"
         progress.stage("trying stiff and extreme scenes", len(cases), hint=hint)
-        for each in cases:
-            known = results.stored(each.name) is not None
-            row = results.row(each.name, CaseRow, each.run)
+        for planned in cases:
+            is_stored = measurements.stored(planned.name) is not None
+            row = measurements.get_row(planned.name, CaseRow, planned.run)
             yield row
-            if not known:
-                progress.message(f"{each.name}: {row.status}, {row.seconds:.1f} s")
+            if not is_stored:
+                progress.message(f"{planned.name}: {row.status}, {row.seconds:.1f} s")
             progress.advance(1)
 
-    def result(rows: list[CaseRow]) -> StabilityResult:
-        return asked.result(StabilityResult, rows=rows, not_run=[each.name for each in cases[len(rows) :]])
+    def make_result(rows: list[CaseRow]) -> StabilityResult:
+        return context.result(StabilityResult, rows=rows, not_run=[planned.name for planned in cases[len(rows) :]])
 
-    return taken_rows(asked, results, rows(), result)
+    return measurements.collect(measure_rows(), make_result)
 
 
 def sentences() -> dict[str, str]:
@@ -458,7 +435,7 @@ def wide_range() -> Outcome:
     slopes = []
     for controls, width in ((wide, 2e4), (narrow, 0.6)):
         renderer = small(controls)
-        loss = smooth_loss(renderer.formation.resolution)
+        loss = gradients.smooth_loss(renderer.formation.resolution)
         each = [float(renderer.gradient(loss, renderer.start, seed, 32)[1][0]) for seed in range(6)]
         slopes.append(statistics.fmean(each) / width)
     error = abs(slopes[0] / slopes[1] - 1.0)
@@ -475,7 +452,7 @@ def light_rotation_texel() -> Outcome:
         "texture": {"resolution": 2},
     }
     renderer = small(controls)
-    u, loss = renderer.start.clone(), smooth_loss(renderer.formation.resolution)
+    u, loss = renderer.start.clone(), gradients.smooth_loss(renderer.formation.resolution)
     u[0], u[1] = 0.5, 0.1
     directions = torch.zeros(3, len(u))
     directions[0, 0] = directions[1, 1] = 1.0
@@ -521,7 +498,7 @@ def heavy_render(count: int = 24) -> Outcome:
     controls = {"pose": {"x": [-0.3, 0.3]}}
     renderer = small(controls).like(transfer="linear")
     renderer.plan = renderer.plan.at_a_pixel()
-    loss = smooth_loss(renderer.formation.resolution)
+    loss = gradients.smooth_loss(renderer.formation.resolution)
     slopes = torch.stack([renderer.gradient(loss, renderer.start, seed, 4)[1] for seed in range(count)]).double()
     away = (slopes - slopes.median()).abs()
     return seen(controls, compare=False, spp=4).also(

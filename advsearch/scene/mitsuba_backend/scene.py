@@ -55,7 +55,7 @@ class MitsubaScene:
         filter: reconstruction filter, "box" or "gaussian".
         leave_out: names from `advsearch.scene.formation.ITEMS`; less than everything only to measure what it brings.
         max_depth: longest light path in segments.
-        sampler: Mitsuba's name of the sampler; some round sample counts up, see `formation.next_count`.
+        sampler: Mitsuba's name of the sampler; some round sample counts up, see `next_count`.
         integrator: Mitsuba's name of the path integrator of primal renders, where there is no medium.
     """
 
@@ -150,6 +150,10 @@ class MitsubaScene:
         finally:
             self.depth = before
 
+    def next_count(self, samples: float, sampler: str | None = None) -> int:
+        """Return how many samples the scene's sampler, or another one, takes if it is asked for at least so many."""
+        return next_count(sampler or self.sampler, samples)
+
     def base(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh torch tensor of the input's shape."""
         key, takes = self.declared[name]
@@ -184,7 +188,7 @@ class MitsubaScene:
             self._set(inputs)
             if population.unused:
                 population.bury()
-            spp = next_count(self.sampler, spp)
+            spp = self.next_count(spp)
             integrators = [self._integrator(what) for what in seeds]
             media = population.media() if self.volumetric else []
             pictures: list[Tensor] = []
@@ -277,7 +281,7 @@ class MitsubaScene:
                     dr.enable_grad(tracked[name])
                     self.parameters[key] = takes.write(tracked[name]) if takes.write else tracked[name]
                 self.parameters.update()
-                spp, arriving = next_count(self.sampler, spp), mi.TensorXf(shown)
+                spp, arriving = self.next_count(spp), mi.TensorXf(shown)
                 mi.set_log_level(mi.LogLevel.Error)  # it warns at every call of a film that samples beyond its border
                 self._integrator(method).render_backward(
                     self._scene, self.parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
@@ -308,12 +312,20 @@ class MitsubaScene:
             held = self._scene, self._sensor, self.parameters
             return material_adjoint(*held, {name: inputs[name] for name in moving}, cotangent=cotangent, **counts)
 
+    @property
+    def material_limits(self) -> tuple[str, ...]:
+        """What `material_adjoint` leaves out or gets wrong, in sentences."""
+        # few scenes search a material
+        from advsearch.scene.mitsuba_backend.material_adjoint import LIMITS
+
+        return tuple(LIMITS)
+
     def transport(self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int) -> Paths:
         """Return what the vertices of light paths add to their pixels for a unit more of an input that is a base
         colour, or a projector's pattern, and the picture of these paths; the others as of `pictures`."""
         with one_at_a_time:
             self._set(inputs)
-            key, spp = self.declared[name][0], next_count(self.sampler, spp)
+            key, spp = self.declared[name][0], self.next_count(spp)
             noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
             noise.set_samples_per_wavefront(spp)
             noise.seed(dr.opaque(mi.UInt32, seed), self.resolution[0] * self.resolution[1] * spp)

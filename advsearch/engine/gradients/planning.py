@@ -7,14 +7,14 @@ from __future__ import annotations
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.engine.gradients import Bench, only
+from advsearch.engine.gradients.bench import Bench, restrict_plan
 from advsearch.engine.problem import Problem
 from advsearch.runs.results import GradientStatus, Measured, PathCut, PathLength
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, Group, compared
@@ -46,18 +46,25 @@ def status_of(cosine: float, converged: float) -> GradientStatus:
     return "noisy" if converged >= GOAL else "reference unusable"
 
 
+def comparable_sets(groups: Iterable[Group]) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
+    """Return sets of groups of one control that have the same valid estimators, and those of these that are worth
+    comparing on each set."""
+    sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
+    for group in groups:
+        sets.setdefault((group.control, group.valid), []).append(group)
+    return [
+        (tuple(members), compared(valid, sum(group.size for group in members))) for (_, valid), members in sets.items()
+    ]
+
+
 def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
     """Return groups of one control with the estimators to compare on them, where there is more than one and none was
     forced: wherever several are valid (`every`), or only where the interior adjoint is preferred so far: over poses,
     the model's loss is so rough that none has won, and over shapes the material form is the quietest."""
-    sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
-    for group in plan.groups:
-        if not group.is_forced and group.valid and (every or group.valid[0] == "adjoint"):
-            sets.setdefault((group.control, group.valid), []).append(group)
-    choices = [
-        (tuple(groups), compared(valid, sum(group.size for group in groups))) for (_, valid), groups in sets.items()
+    open_groups = [
+        group for group in plan.groups if not group.is_forced and group.valid and (every or group.valid[0] == "adjoint")
     ]
-    return [choice for choice in choices if len(choice[1]) > 1]
+    return [(groups, estimators) for groups, estimators in comparable_sets(open_groups) if len(estimators) > 1]
 
 
 REPEATS = 3  # gradients that are taken of everything that is compared
@@ -78,7 +85,7 @@ def measured_plan(bench: Bench, *, repeats: int = REPEATS, every: bool = False, 
         is taken off the others' errors."""
         measured, seconds, noise = dict[str, Tensor](), dict[str, float](), dict[str, float]()
         for estimator in candidates:
-            alone = only(plan, {group.name for group in groups}, estimator)
+            alone = restrict_plan(plan, {group.name for group in groups}, estimator)
             place = f"{groups[0].name} by {estimator}"
             several, seconds[estimator] = bench.gradients(alone, "plan", repeats, place)
             if counted:
@@ -159,7 +166,7 @@ def cosines(bench: Bench, *, counts: Sequence[int] = COUNTS) -> Iterator[Measure
         for factor in factors:
             if factor == FACTORS[-1] and reached:
                 break
-            plan = only(base.with_steps(factor), {group.name for group in groups})
+            plan = restrict_plan(base.with_steps(factor), {group.name for group in groups})
             if plan in tried:  # no step can be wider
                 continue
             tried.append(plan)

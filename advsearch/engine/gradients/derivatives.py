@@ -1,0 +1,317 @@
+"""Measures gradient estimators on a scene as it is: error, noise and cost, along *probes*, directions in u, against
+central differences with common random numbers at two step sizes (docs/gradients.md)."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.engine.gradients.bench import Bench, Loss, restrict_plan
+from advsearch.runs.results import GradientStatus, Measured
+from advsearch.scene.gradients import STEP_RANGE, Group, compared
+
+SMALL = 0.1  # share of a control's largest derivative that each of its derivatives counts as, at least
+COORDINATEWISE = 8  # groups of at most this many coordinates are probed one by one
+TOLERANCE = 0.05  # relative error that the mean of an estimator may have beyond the noise
+LOUD = 0.2  # noise of one gradient, relative to its size, from which it is called noisy
+SURE = 0.02  # standard error of a reference, relative to its size, from which on it gets no more seeds
+CONFIDENCE = 2.5  # standard errors within which two means agree
+FACTORS = (1.0, 3.0, 9.0, 1.0 / 3.0)
+"""Steps of differences that are tried in turn, as multiples of the plan's. A step that moves an outline by a pixel is
+as wide as a classifier's loss allows; a smooth loss allows more, and noise falls with the step. What moves no outline
+has a share of its range for a step, which may be too wide."""
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """A `direction` (d,) along which a derivative is measured, largest element 1, zero outside the group; a difference
+    along it has the half-width `step`. The name is `control.parameter`, with the coordinate's number if a group has
+    several and they are probed singly."""
+
+    group: Group
+    name: str
+    direction: Tensor
+    step: float
+
+
+class Reference(NamedTuple):
+    """A derivative by high-sample central differences: the mean over seeds, extrapolated from two `steps` to zero
+    (Richardson). Its `noise` is the standard error together with a quarter of the steps' disagreement; `factor` is the
+    larger step as a multiple of the probe's."""
+
+    value: float
+    noise: float
+    steps: tuple[float, float]
+    renders: int
+    factor: float = 1.0
+
+
+class Estimate(NamedTuple):
+    """What one estimator says along a probe: the mean over seeds, the standard deviation (`noise`) and median seconds
+    of one estimate. Differences are `factor` times as wide as planned."""
+
+    estimator: str
+    value: float
+    noise: float
+    repeats: int
+    seconds: float
+    factor: float = 1.0
+
+
+def smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
+    """Return a linear loss with smooth weights: a sum of a few waves of the picture's size, other in each channel.
+
+    They fall to zero at the picture's edge (a Hann window). With a hard edge the loss would be as rough as whatever
+    moves across it, a photographed interior above all, and its differences would depend on the step.
+    """
+    generator = torch.Generator().manual_seed(seeds.stream(seed, "smooth loss"))
+    height, width = resolution
+    rows = torch.linspace(-1.0, 1.0, height)[:, None, None]
+    columns = torch.linspace(-1.0, 1.0, width)[None, :, None]
+    weights = torch.zeros(height, width, 3)
+    for _ in range(6):
+        across, down, phase, size = (torch.rand(3, generator=generator) * 2.0 - 1.0 for _ in range(4))
+        weights += size * torch.cos(math.pi * (1.2 * across * columns + 1.2 * down * rows + phase))
+    window = torch.cos(0.5 * math.pi * rows).square() * torch.cos(0.5 * math.pi * columns).square()
+    weights *= window / (height * width)
+
+    def loss(image: Tensor) -> Tensor:
+        return (image * weights).sum()
+
+    return loss
+
+
+def compare_with_reference(
+    estimate: Estimate, reference: Reference, others: Sequence[Reference] = (), probe: Probe | None = None,
+    spp: int = 0,
+) -> Measured:  # fmt: skip
+    """Say how good an estimate is along a probe, from so many samples a pixel: "reference unusable" where the
+    reference's noise exceeds `LOUD` and doubt (`CONFIDENCE` standard errors of both) covers the error; "biased" where
+    the error of the mean exceeds `TOLERANCE` beyond doubt; "noisy" where the noise exceeds `LOUD`; otherwise "ok".
+
+    The size that this is relative to is the reference's, or `SMALL` of the largest of the `others` of its control: a
+    derivative that happens to be near zero has no size of its own to speak of.
+    """
+    size = max([abs(reference.value), *(SMALL * abs(other.value) for other in others)])
+    difference = abs(estimate.value - reference.value)
+    doubt = CONFIDENCE * math.hypot(estimate.noise / math.sqrt(max(1, estimate.repeats)), reference.noise)
+    status: GradientStatus
+    if difference <= doubt and reference.noise > LOUD * size:
+        status = "reference unusable"
+    elif difference > TOLERANCE * size + doubt:
+        status = "biased"
+    else:
+        status = "noisy" if estimate.noise > LOUD * size else "ok"
+
+    def relative(value: float) -> float:
+        return value / size if size > 0.0 else math.inf if value else 0.0
+
+    return Measured(
+        quantity="derivative", control=probe.group.control if probe else "",
+        parameter=probe.name.partition(".")[2] if probe else "", estimator=estimate.estimator, factor=estimate.factor,
+        spp=spp, repeats=estimate.repeats, seconds=estimate.seconds, status=status,
+        error=relative(math.hypot(difference, estimate.noise)), bias=relative(difference),
+        doubt=relative(doubt) if size > 0.0 else 0.0, noise=relative(estimate.noise) if size > 0.0 else math.inf,
+        value=estimate.value, reference=reference.value, reference_error=relative(reference.noise),
+    )  # fmt: skip
+
+
+def as_planned(group: Group) -> list[tuple[str, float]]:
+    return [(group.estimator, 1.0)]
+
+
+def list_attempts(group: Group) -> list[tuple[str, float]]:
+    """Return every estimator to measure on a group, with the multiple of the step; then other steps.
+
+    Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.
+    """
+    forced, steps = group.is_forced, {group.step}
+    tries = as_planned(group) if forced else [(name, 1.0) for name in compared(group.valid, group.size)]
+    wide = [name for name in ("differences", "secant") if (name, 1.0) in tries][:1]
+    for factor in FACTORS[1:]:
+        step = min(factor * group.step, STEP_RANGE[1])
+        if step not in steps:
+            steps.add(step)
+            tries += [(name, factor) for name in wide]
+    return tries
+
+
+def find_probes(bench: Bench) -> list[Probe]:
+    """Return what is worth measuring in a renderer's space: every continuous coordinate, or a direction in many."""
+    probes = []
+    for group in bench.renderer.plan.groups:
+        if group.estimator == "none":
+            continue
+        if group.size > COORDINATEWISE:
+            step = group.step if group.size <= 64 else 0.03
+            probes.append(Probe(group, group.name, _mixed_direction(bench, group), step))
+            continue
+        for number in range(group.size):
+            direction = torch.zeros_like(bench.u)
+            direction[group.begin + number] = 1.0
+            name = group.name if group.size == 1 else f"{group.name}.{number}"
+            probes.append(Probe(group, name, direction, group.step))
+    return probes
+
+
+def _mixed_direction(bench: Bench, group: Group) -> Tensor:
+    """Return a direction (d,) in a group: mostly the signs of the estimator's own gradient, so that there is something
+    to see, and a share of random signs, so that what the estimator leaves out shows too."""
+    plan = restrict_plan(bench.renderer.plan, [group.name])
+    gradient = bench.gradient(plan, seeds.stream(bench.seed, "probe"))[group.coordinates]
+    generator = torch.Generator().manual_seed(seeds.stream(bench.seed, "probe signs"))
+    random_signs = torch.randint(0, 2, gradient.shape, generator=generator).to(gradient.dtype) * 2.0 - 1.0
+    mixed = gradient.sign() + 0.5 * random_signs
+    direction = torch.zeros_like(bench.u)
+    direction[group.coordinates] = mixed / mixed.abs().max().clamp_min(1e-12)
+    return direction
+
+
+def measure_reference(
+    bench: Bench, probe: Probe, *, repeats: tuple[int, int] = (3, 16), factors: Sequence[float] = (1.0,)
+) -> Reference:
+    """Return the derivative along a probe by central differences at two steps, with its noise.
+
+    Seeds are added until the standard error is below `SURE` of the value, between the two numbers of `repeats`. With
+    several `factors`, each gets the smaller number of seeds, both steps so many times wider, until one is sure enough;
+    if none is, the one with the least noise goes on.
+    """
+    renders_before = bench.renderer.renders
+    pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
+
+    def measure(factor: float, count: int) -> tuple[Reference, float]:
+        """Take differences at a step and at half of it until there are so many pairs, of the same seeds each."""
+        step = probe.step if factor == 1.0 else min(STEP_RANGE[1], factor * probe.step)
+        for number in range(len(pairs[factor]), count):
+            noise = seeds.stream(bench.seed, "reference", number)
+            pairs[factor].append((_difference(bench, probe, step, noise), _difference(bench, probe, 0.5 * step, noise)))
+        extrapolated = [(4.0 * fine - coarse) / 3.0 for coarse, fine in pairs[factor]]
+        coarse_mean = statistics.fmean(coarse for coarse, _ in pairs[factor])
+        fine_mean = statistics.fmean(fine for _, fine in pairs[factor])
+        error = math.inf
+        if len(extrapolated) > 1:
+            error = statistics.stdev(extrapolated) / math.sqrt(len(extrapolated))
+        noise_of_both = math.hypot(error, 0.25 * (coarse_mean - fine_mean))
+        return Reference(statistics.fmean(extrapolated), noise_of_both, (coarse_mean, fine_mean), 0, factor), error
+
+    measured = dict[float, tuple[Reference, float]]()
+    for factor in factors:
+        reference, error = measured[factor] = measure(factor, repeats[0])
+        if error <= SURE * abs(reference.value):
+            break
+    else:
+        best = min(measured, key=lambda factor: measured[factor][0].noise)
+        reference, error = measured[best]
+        while error > SURE * abs(reference.value) and len(pairs[best]) < repeats[1]:
+            reference, error = measure(best, len(pairs[best]) + 1)
+    return reference._replace(renders=bench.renderer.renders - renders_before)
+
+
+def _difference(bench: Bench, probe: Probe, step: float, seed: int) -> float:
+    """Return one central difference of the loss along a probe, with one seed on both sides."""
+    move = step * probe.direction
+    width = 2.0 * step
+    if probe.group.periodic:
+        above, below = (bench.u + move).remainder(1.0), (bench.u - move).remainder(1.0)
+    else:
+        above, below = (bench.u + move).clamp(0.0, 1.0), (bench.u - move).clamp(0.0, 1.0)
+        if probe.group.size <= COORDINATEWISE:
+            width = float((above - below) @ probe.direction)
+    with torch.no_grad():
+        high, low = (float(bench.loss(bench.renderer(at, seed, bench.spp))) for at in (above, below))
+    return (high - low) / width
+
+
+def measure_estimates(
+    bench: Bench, estimator: str, probes: Sequence[Probe], repeats: int, factor: float
+) -> list[Estimate]:
+    """Measure one estimator of one control's groups along some probes of them, its differences `factor` times as wide
+    as planned."""
+    names = {probe.group.name for probe in probes}
+    plan = restrict_plan(bench.renderer.plan.with_steps(factor), names, estimator)
+    stream = estimator if factor == 1.0 else f"{estimator} x {factor:g}"
+    gradients, seconds = bench.gradients(plan, stream, repeats)
+    estimates = []
+    for probe in probes:
+        slopes = [float(gradient @ probe.direction) for gradient in gradients]
+        mean = statistics.fmean(slopes)
+        estimates.append(Estimate(estimator, mean, statistics.stdev(slopes), repeats, seconds, factor))
+    return estimates
+
+
+def measure_derivatives(
+    bench: Bench, *, reference_spp: int, seeds_of_reference: tuple[int, int],
+    reference_factors: Sequence[float] = (1.0,),
+    tried: Callable[[Group], Sequence[tuple[str, float]]] = as_planned, repeats: tuple[int, int] = (6, 8),
+    stage: Callable[[str, int], None] = lambda name, steps: None,
+) -> Iterator[Measured]:  # fmt: skip
+    """Measure the derivative by each parameter of a renderer's space beside differences of many samples.
+
+    Args:
+        reference_spp, seeds_of_reference, reference_factors: as `spp` of the bench, and as `repeats` and `factors` of
+            `measure_reference`.
+        tried: from a group the estimators to try, by default as planned, with multiples of the step; a wider one on
+            what is not `ok` yet.
+        repeats: gradients by an estimator at first, and by one with another step, which has to be surer.
+        stage: is told what begins and of how many steps.
+    """
+
+    def refer(probe: Probe) -> Reference:
+        # what acts on the picture clips: its mean depends on the noise, so both get the same
+        spp = bench.spp if probe.group.estimator == "image" else max(bench.spp, reference_spp)
+        finer = replace(bench, spp=spp)
+
+        def measure() -> dict[str, Any]:
+            return measure_reference(finer, probe, repeats=seeds_of_reference, factors=reference_factors)._asdict()
+
+        reference = Reference(**bench.keep(f"reference {probe.name}", measure))
+        bench.tick(bench.spp)
+        return reference
+
+    for control, control_probes in groupby(find_probes(bench), lambda probe: probe.group.control):
+        probes = list(control_probes)
+        stage(f"references for {control}", len(probes))
+        references = {probe.name: refer(probe) for probe in probes}
+        sets: dict[tuple[tuple[str, ...], str], list[Probe]] = {}  # each comes from one gradient
+        for probe in probes:
+            sets.setdefault((probe.group.valid, probe.group.estimator), []).append(probe)
+        stage(f"gradients for {control}", sum(len(tried(members[0].group)) for members in sets.values()))
+        for members in sets.values():
+            yield from _try_estimators(bench, members, references, tried(members[0].group), repeats)
+
+
+def _try_estimators(
+    bench: Bench, probes: Sequence[Probe], references: Mapping[str, Reference], tries: Sequence[tuple[str, float]],
+    repeats: tuple[int, int],
+) -> Iterator[Measured]:  # fmt: skip
+    """Yield how estimators agree with references along probes; other steps are tried where none was `ok` before."""
+    good: set[str] = set()
+    for estimator, factor in tries:
+        wanted = list(probes) if factor == 1.0 else [probe for probe in probes if probe.name not in good]
+        if not wanted:
+            break
+        count = repeats[0] if factor == 1.0 else repeats[1]
+        name = f"{estimator} x {factor:g} {','.join(probe.name for probe in wanted)}"
+        stored = bench.keep(name, partial(_estimates_as_json, bench, estimator, wanted, count, factor))
+        for probe, estimate in zip(wanted, stored, strict=True):
+            others = list(references.values())
+            row = compare_with_reference(Estimate(**estimate), references[probe.name], others, probe, bench.spp)
+            if row.status == "ok":
+                good.add(probe.name)
+            yield row
+        bench.tick(bench.spp)
+
+
+def _estimates_as_json(
+    bench: Bench, estimator: str, probes: Sequence[Probe], repeats: int, factor: float
+) -> list[dict[str, Any]]:
+    return [estimate._asdict() for estimate in measure_estimates(bench, estimator, probes, repeats, factor)]
