@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from advsearch import seeds as seeds
+    from advsearch import settings as settings
     from advsearch import statistics as statistics
+    from advsearch.api import workbench as workbench
     from advsearch.attacks import Domain as Domain
     from advsearch.attacks import Evaluation as Evaluation
     from advsearch.attacks import Policy as Policy
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
     from advsearch.report.shown import InNotebook as InNotebook
     from advsearch.report.shown import ResultPart as ResultPart
     from advsearch.report.shown import ShownResult as ShownResult
+    from advsearch.runs import results as results
     from advsearch.runs.directory import RunDirectory as RunDirectory
     from advsearch.runs.directory import find_run as find_run
     from advsearch.runs.exporters import Exported as Exported
@@ -56,10 +59,11 @@ if TYPE_CHECKING:
     from advsearch.runs.results import RunResult as RunResult
     from advsearch.runs.store import Store as Store
     from advsearch.runs.summary import read_result as read_result
+    from advsearch.scene import assets as assets
     from advsearch.scene import color as color
     from advsearch.scene import geometry as geometry
+    from advsearch.scene import library as library
     from advsearch.scene.description import SceneDescription as SceneDescription
-    from advsearch.settings import Clash as Clash
     from advsearch.settings import Config as Config
     from advsearch.settings import setting as setting
     from advsearch.settings import setting_as_in as setting_as_in
@@ -67,6 +71,8 @@ if TYPE_CHECKING:
     from advsearch.tasks import Judgement as Judgement
     from advsearch.tasks import Prediction as Prediction
     from advsearch.tasks import Task as Task
+    from advsearch.trust import stored_files as stored_files
+    from advsearch.trust import writing as writing
 
 _NAMES = {
     "advsearch.attacks": ("Domain", "Evaluation", "Policy", "Proposal"),
@@ -87,18 +93,25 @@ _NAMES = {
     "advsearch.runs.store": ("Store",),
     "advsearch.runs.summary": ("read_result",),
     "advsearch.scene.description": ("SceneDescription",),
-    "advsearch.settings": ("Clash", "Config", "setting", "setting_as_in"),
+    "advsearch.settings": ("Config", "setting", "setting_as_in"),
     "advsearch.tasks": ("Facts", "Judgement", "Prediction", "Task"),
 }
 """The names of the interface, by the module that each is imported from."""
 
 _MODULES = {
+    "assets": "advsearch.scene.assets",
     "color": "advsearch.scene.color",
     "figures": "advsearch.report.figures",
     "geometry": "advsearch.scene.geometry",
+    "library": "advsearch.scene.library",
+    "results": "advsearch.runs.results",
     "seeds": "advsearch.seeds",
+    "settings": "advsearch.settings",
     "statistics": "advsearch.statistics",
+    "stored_files": "advsearch.trust.stored_files",
     "wording": "advsearch.report.wording",
+    "workbench": "advsearch.api.workbench",
+    "writing": "advsearch.trust.writing",
 }
 """Modules of functions that belong to the interface as a whole."""
 

@@ -22,6 +22,7 @@ from advsearch.settings.values import (
     split_names,
     texts,
 )
+from advsearch.settings.values import merged as merged
 
 __all__ = [
     "FILES",

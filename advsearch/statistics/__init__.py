@@ -1,4 +1,22 @@
 """Statistics of counts and shares: intervals, sequential rules, paired and clustered tests.
 
-Pure functions of numbers and arrays, each with its source. Nothing here knows a run, a trial or a drive.
+Pure functions of numbers and arrays, each with its source. Nothing here knows a run, a trial or a drive. A module is
+imported when it is first used, since scipy takes long.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from advsearch.statistics import clustered, intervals, monotone, paired, sequential
+
+__all__ = ["clustered", "intervals", "monotone", "paired", "sequential"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a module of the package on first use (PEP 562)."""
+    if name in __all__:
+        return import_module(f"advsearch.statistics.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
