@@ -226,6 +226,8 @@ class Experiment(Generic[AnyResult]):
         help_suffix: what its help adds to the line in the catalog.
         exit_status: ``result -> int``, the exit status of the command.
         choices: "module:function" that returns the names that `about` may have, each with a line of help.
+        choice_description: "module:function" from one of these names to a text and its facts as JSON values, for
+            `advsearch show`.
         view: ``result -> ShownResult``, what terminal, page and notebook show; None shows all fields.
         claims: ``result -> claims`` that a run supports, for `advsearch report`.
         page: ``(run, result) -> HTML or None``, for a page of its own kind.
@@ -246,6 +248,7 @@ class Experiment(Generic[AnyResult]):
     help_suffix: str = ""
     exit_status: Callable[[Any], int] = succeed
     choices: str = ""
+    choice_description: str = ""
     view: Callable[[Any], ShownResult] | None = None
     claims: Callable[[Any], Iterable[Claim]] | None = None
     page: Callable[[Path, Any], str | None] | None = None

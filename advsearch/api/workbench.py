@@ -25,6 +25,11 @@ from advsearch.questions.attack.carry_out import executor_for as executor_for
 from advsearch.questions.attack.carry_out import problem_of as problem_of
 from advsearch.questions.photographs.carry_out import Photographs as Photographs
 from advsearch.questions.photographs.carry_out import photographs_in as photographs_in
+from advsearch.questions.photographs.result import LOOSE_PHOTO as LOOSE_PHOTO
+from advsearch.questions.photographs.result import PHOTO as PHOTO
 from advsearch.questions.sweep.carry_out import row_parameters as row_parameters
+from advsearch.questions.sweep.display import surface_sentences as surface_sentences
+from advsearch.runs.tables import units_of as units_of
 from advsearch.tasks import make_task as make_task
 from advsearch.threads import all_for_torch as all_for_torch
+from advsearch.threads import cores as cores

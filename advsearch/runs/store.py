@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
-from advsearch.options import Value
+from advsearch.options import OUT_OF_VIEW, Value
 from advsearch.runs.files import SCHEMA, check_version, connect_to_write
 from advsearch.runs.results import plain
 from advsearch.trust.databases import DAMAGED, check_schema, connect_to_read, readable
@@ -62,6 +62,11 @@ class Row:
     time: float | None = None
     id: int | None = None
 
+    @property
+    def is_out_of_view(self) -> bool:
+        """Whether the object could not be seen in the image, so that nothing was predicted."""
+        return self.label == OUT_OF_VIEW
+
 
 @dataclass(frozen=True)
 class Told:
@@ -101,6 +106,16 @@ class Store:
             check_version(self._db, path)
             check_schema(self._db, path, SCHEMA)
         self._closed: Callable[[], None] | None = None if read_only else note_open(path)
+
+    @staticmethod
+    def is_in(run: Path) -> bool:
+        """Return whether a run directory has results."""
+        return (run / NAME).is_file()
+
+    @classmethod
+    def open_to_read(cls, run: Path) -> Store:
+        """Open the results in a run directory for reading, beside a process that may write."""
+        return cls(run / NAME, read_only=True)
 
     def append(self, rows: Sequence[Row], told: Told | None = None) -> None:
         """Add rows in one transaction; they survive a kill of the process when this returns, and where the disk is full

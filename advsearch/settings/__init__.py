@@ -5,7 +5,18 @@
 
 from __future__ import annotations
 
-from advsearch.settings.configuration import FILES, Clash, Config, PythonOnly, Setting, setting, setting_as_in, settings
+from advsearch.settings.configuration import (
+    FILES,
+    PLACE,
+    Clash,
+    Config,
+    PythonOnly,
+    Setting,
+    SettingsError,
+    setting,
+    setting_as_in,
+    settings,
+)
 from advsearch.settings.values import (
     HEADER,
     all_finite,
@@ -13,6 +24,7 @@ from advsearch.settings.values import (
     as_text,
     check_once,
     each_once,
+    merged,
     names_together,
     number_or_text,
     parse_assignment,
@@ -22,20 +34,22 @@ from advsearch.settings.values import (
     split_names,
     texts,
 )
-from advsearch.settings.values import merged as merged
 
 __all__ = [
     "FILES",
     "HEADER",
+    "PLACE",
     "Clash",
     "Config",
     "PythonOnly",
     "Setting",
+    "SettingsError",
     "all_finite",
     "as_python",
     "as_text",
     "check_once",
     "each_once",
+    "merged",
     "names_together",
     "number_or_text",
     "parse_assignment",
