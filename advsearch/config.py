@@ -90,6 +90,7 @@ class SceneConfig(Config):
     directory. None means "choose for me", and the description says how."""
 
     free: ClassVar[tuple[str, ...]] = (*Config.free, "ask")
+    default_environment: ClassVar[str] = DEFAULT_ENVIRONMENT
     several: ClassVar[tuple[str, ...]] = ()  # which of object, environment and model may be several, with commas
     # fmt: off
     clashes: ClassVar[tuple[Clash, ...]] = (

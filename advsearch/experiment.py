@@ -22,9 +22,9 @@ from typing import Any, Generic, NamedTuple, TypeVar, get_args, get_type_hints
 from advsearch import registry, threads
 from advsearch.errors import FELL_SHORT
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress, watcher
+from advsearch.progress import NullProgress, Progress, Stages, watcher
 from advsearch.report.shown import Claim, ShownResult, result_figure, shown
-from advsearch.runs.directory import CONFIG, RunDirectory, begun, is_run
+from advsearch.runs.directory import CONFIG, RunDirectory, begun, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.runs.measurements import Measurements
 from advsearch.runs.results import INTERRUPTED, Result
@@ -80,6 +80,11 @@ class RunContext(ExitStack, Generic[Settings]):
     def run(self) -> RunDirectory:
         """The run directory. The first access creates it, so check everything that may be wrong before."""
         return self.enter_context(RunDirectory.of(self.config, self.resumed))
+
+    @cached_property
+    def stages(self) -> Stages:
+        """The stages of the experiment; their seconds count from the first access."""
+        return Stages(self.progress)
 
     @property
     def has_run(self) -> bool:
@@ -168,6 +173,14 @@ def run_experiment(config: Config, *, progress: Progress | None = None, resumed:
         return experiment.run(config, progress=progress, resumed=folder)
 
 
+def find_stopped_run(config: Config) -> Path | None:
+    """Return the folder of the run that the settings name; None where there is none yet."""
+    place, _ = config.place
+    if place is None or not is_run(run_path(place)):
+        return None
+    return run_path(place)
+
+
 def run_part(folder: Path, config: Config, progress: Progress, run: Callable[..., Result] | None = None) -> Result:
     """Run an experiment in a folder, continue it there, or read its result if it has ended.
 
@@ -216,10 +229,15 @@ class Experiment(Generic[AnyResult]):
         about: the setting that names a run or a file which the experiment is about.
         positional: how the command line takes `about` without its flag; None for not at all.
         defaults_from_run: ``(run.yaml, typed arguments) -> settings`` that the run in `about` provides.
-        python_function: "module:function" that Python calls, where it takes more than settings; else it is made.
+        python_function: "module:function" that Python calls, where it is not the one made of the settings.
+        python_arguments: "module:function" whose keyword-only parameters Python callers may pass beside settings; those
+            that they pass go to `function`. A positional setting that is among them may be a loaded object.
+        resumes_in_python: whether Python callers may continue the run that `run` names, with `resume=True`.
         help_suffix: what its help adds to the line in the catalog.
         exit_status: ``result -> int``, the exit status of the command.
         choices: "module:function" that returns the names that `about` may have, each with a line of help.
+        choice_description: "module:function" from one of these names to a text and its facts as JSON values, for
+            `advsearch show`.
         view: ``result -> ShownResult``, what terminal, page and notebook show; None shows all fields.
         claims: ``result -> claims`` that a run supports, for `advsearch report`.
         triggering: ``result -> lines``, conditions under which the model is wrong more often, for `advsearch report`.
@@ -238,9 +256,12 @@ class Experiment(Generic[AnyResult]):
     positional: PositionalArgument | None = None
     defaults_from_run: Callable[[Path, Mapping[str, Any]], dict[str, Any]] | None = None
     python_function: str = ""
+    python_arguments: str = ""
+    resumes_in_python: bool = False
     help_suffix: str = ""
     exit_status: Callable[[Any], int] = succeed
     choices: str = ""
+    choice_description: str = ""
     view: Callable[[Any], ShownResult] | None = None
     claims: Callable[[Any], Iterable[Claim]] | None = None
     triggering: Callable[[Any], Iterable[str]] | None = None
@@ -267,15 +288,23 @@ class Experiment(Generic[AnyResult]):
         return self._make_python_function()
 
     def _make_python_function(self) -> Callable[..., Any]:
-        from advsearch.api.keywords import asks, configured  # imports torch
-
-        def function(*args: Any, progress: Any = None, **settings: Any) -> AnyResult:
-            positional = dict(zip(self.positional_args, args, strict=False))
-            config = configured(self.settings, **positional, **settings)
-            return self.run(config, progress=watcher(progress))
+        from advsearch.api.keywords import asks, configured, name_loaded  # imports torch
 
         kinds = inspect.Parameter
+        own = self._find_python_arguments()
+
+        def function(*args: Any, progress: Any = None, resume: bool = False, **settings: Any) -> AnyResult:
+            given = {**dict(zip(self.positional_args, args, strict=False)), **settings}
+            arguments = {name: given[name] for name in own if name in given}
+            given = {name: value for name, value in given.items() if name not in own or name in self.positional_args}
+            config = configured(self.settings, **name_loaded(given, own))
+            resumed = find_stopped_run(config) if resume else None
+            return self.run(config, progress=watcher(progress), resumed=resumed, **arguments)
+
         parameters = [self._make_positional_parameter(name) for name in self.positional_args]
+        parameters += [parameter for name, parameter in own.items() if name not in self.positional_args]
+        if self.resumes_in_python:
+            parameters.append(kinds("resume", kinds.KEYWORD_ONLY, default=False, annotation="bool"))
         parameters.append(kinds("progress", kinds.KEYWORD_ONLY, default=None, annotation="Watched"))
         parameters.append(kinds("settings", kinds.VAR_KEYWORD))
         signature = inspect.Signature(parameters, return_annotation=self.result.__name__)
@@ -285,6 +314,13 @@ class Experiment(Generic[AnyResult]):
         function.__doc__ = self.function.__doc__
         function.__module__ = self.function.__module__
         return asks(self.settings)(function)
+
+    def _find_python_arguments(self) -> dict[str, inspect.Parameter]:
+        """Return the parameters that Python callers may pass beside settings, by name."""
+        if not self.python_arguments:
+            return {}
+        parameters = inspect.signature(registry.imported(self.python_arguments)).parameters
+        return {name: one for name, one in parameters.items() if one.kind is one.KEYWORD_ONLY}
 
     def _make_positional_parameter(self, name: str) -> inspect.Parameter:
         setting = self.settings.model_fields[name]

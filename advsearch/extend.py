@@ -68,9 +68,9 @@ if TYPE_CHECKING:
     from advsearch.scene import assets as assets
     from advsearch.scene import color as color
     from advsearch.scene import geometry as geometry
+    from advsearch.scene import library as library
     from advsearch.scene import parts as parts
     from advsearch.scene.description import SceneDescription as SceneDescription
-    from advsearch.settings import Clash as Clash
     from advsearch.settings import Config as Config
     from advsearch.settings import setting as setting
     from advsearch.settings import setting_as_in as setting_as_in
@@ -100,7 +100,7 @@ _NAMES = {
     "advsearch.runs.store": ("Store",),
     "advsearch.runs.summary": ("read_result",),
     "advsearch.scene.description": ("SceneDescription",),
-    "advsearch.settings": ("Clash", "Config", "setting", "setting_as_in"),
+    "advsearch.settings": ("Config", "setting", "setting_as_in"),
     "advsearch.tasks": ("Facts", "Judgement", "Prediction", "Task"),
 }
 """The names of the interface, by the module that each is imported from."""
@@ -112,6 +112,7 @@ _MODULES = {
     "geometry": "advsearch.scene.geometry",
     "gradients": "advsearch.engine.gradients",
     "images": "advsearch.controls.support.images",
+    "library": "advsearch.scene.library",
     "parts": "advsearch.scene.parts",
     "results": "advsearch.runs.results",
     "seeds": "advsearch.seeds",

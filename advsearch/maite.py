@@ -24,7 +24,7 @@ from advsearch.engine import loading
 from advsearch.engine.judging import domain_of
 from advsearch.errors import InputError
 from advsearch.models.labels import find_label_set
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.color import to_8_bit
 from advsearch.scene.outlines import seen_things
 from advsearch.tasks import make_task
 

@@ -13,7 +13,6 @@ import os
 import platform
 import sys
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -104,18 +103,6 @@ def all_for_torch() -> Iterator[None]:
         yield
     finally:
         configure(_chosen)
-
-
-@contextmanager
-def one_each_for_torch() -> Iterator[ThreadPoolExecutor]:
-    """As many threads as torch has, each of which has one of torch's: side by side they wait at no barriers."""
-    torch = sys.modules["torch"]
-    count = torch.get_num_threads()
-    with ThreadPoolExecutor(count, "advsearch-torch", torch.set_num_threads, (1,)) as pool:
-        try:
-            yield pool
-        finally:
-            torch.set_num_threads(count)
 
 
 def apply_to_drjit() -> None:

@@ -26,7 +26,7 @@ from torch import Tensor, nn  # noqa: E402
 from advsearch import seeds  # noqa: E402
 from advsearch.controls import compose  # noqa: E402
 from advsearch.engine.loading import as_controls, framed, load_scene, make_renderer  # noqa: E402
-from advsearch.scene.formation import to_8_bit  # noqa: E402
+from advsearch.scene.color import to_8_bit  # noqa: E402
 
 SIDE, FOV, SPP = 32, 35.0, 8
 SPEEDS = 0.5, 1.5

@@ -22,7 +22,7 @@ from advsearch import load_scene
 from advsearch.catalog import list_built_ins
 from advsearch.controls import make_space
 from advsearch.engine.loading import as_controls, make_renderer
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.color import to_8_bit
 
 FOLDER = Path(__file__).resolve().parent / "images" / "controls"
 SPP = 128

@@ -197,7 +197,7 @@ def scene_parameters(record: Record) -> str:
 
 def objects(record: Record) -> str:
     """The bundled objects with the labels that the reference model gives them."""
-    from advsearch.bundled.objects import OBJECTS
+    from advsearch.questions.harden.objects import OBJECTS
 
     return table(["object", "label"], [[f"`{one.name}`", one.label] for one in OBJECTS.values()])
 

@@ -19,7 +19,7 @@ import torch
 from PIL import Image
 
 import advsearch
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.color import to_8_bit
 from advsearch.scene.glb import GlbBuffer
 
 PICTURE = Path(__file__).resolve().parent / "images" / "rigged.webp"

@@ -17,7 +17,7 @@ from PIL import Image
 from advsearch import load_scene
 from advsearch.controls import Space
 from advsearch.engine.loading import framed, make_renderer
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.color import to_8_bit
 
 IMAGES = Path(__file__).resolve().parent / "images"
 VIEWS = (

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from advsearch.bundled.objects import OBJECTS, ObjectFamily
+from advsearch.questions.harden.objects import OBJECTS, ObjectFamily
 from advsearch.scene.assets import Mesh
 from advsearch.scene.importing.hdr import read_exr
 from scenes.environments import ENVIRONMENTS, EnvironmentFamily
@@ -46,7 +46,7 @@ def object_files(family: ObjectFamily) -> dict[str, bytes]:
         "name": asset.name,
         "label": asset.label,
         "material": asdict(asset.material),
-        # the family's file has moved to advsearch/bundled/objects; what is shipped keeps its bytes
+        # the family's file has moved to advsearch/questions/harden/objects; what is shipped keeps its bytes
         "source": f"scenes/objects/{family.make.__module__.rpartition('.')[2]}.py"
         if asset.mesh.rig is None
         else "scenes/person.py, of MakeHuman's data (CC0 1.0)",

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.bundled.objects import HOUSEHOLD, OBJECTS
+from advsearch.questions.harden.objects import HOUSEHOLD, OBJECTS
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import mesh_part

@@ -478,7 +478,7 @@ def areas(charts: Array, faces: Indices) -> Array:
 
 
 def made(folder: Path) -> dict[str, npt.NDArray[np.generic]]:
-    """Return the arrays of body.npz; `advsearch.bundled.objects.people` says what each is."""
+    """Return the arrays of body.npz; `advsearch.questions.harden.objects.people` says what each is."""
     human = MakeHuman(folder)
     corners, weights, joints = human.corners(), human.weights(), human.joints()
     shape, bodies = corners.shape[:4], corners.reshape(-1, *human.base.shape)

@@ -24,8 +24,8 @@ from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.axes import Points, on_grid, read_axes
 from advsearch.runs.results import plain
+from advsearch.scene.color import to_8_bit
 from advsearch.scene.description import describe
-from advsearch.scene.formation import to_8_bit
 from advsearch.tasks import Classification
 
 SIZE = 16

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.models import reference
-from advsearch.models.reference import Augmentation
+from advsearch.questions.harden.networks import Augmentation
 
 
 def images(count: int = 2, height: int = 8, width: int = 8, seed: int = 0) -> Tensor:

@@ -31,7 +31,7 @@ import pathlib
 import numpy as np
 
 import advsearch
-from advsearch.bundled.objects import OBJECTS
+from advsearch.questions.harden.objects import OBJECTS
 from advsearch.models import load_model
 from advsearch.scene.library import list_environments, list_objects, load_environment, load_object
 

@@ -156,9 +156,9 @@ def default_views(spp: int = 64) -> dict[str, float]:
     import torch
     from reference_scenes import SIZE
 
-    from advsearch.bundled.objects import HOUSEHOLD
     from advsearch.controls import Space
     from advsearch.models import reference
+    from advsearch.questions.harden.objects import HOUSEHOLD
     from advsearch.scene.description import describe
     from advsearch.scene.formation import ImageFormation
     from advsearch.scene.mitsuba_backend.scene import MitsubaScene

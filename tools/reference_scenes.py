@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from advsearch.bundled.changed_light import varied
-from advsearch.bundled.objects import HOUSEHOLD
 from advsearch.controls import Space
+from advsearch.questions.harden.changed_light import varied
+from advsearch.questions.harden.objects import HOUSEHOLD
 from advsearch.scene import library
 from advsearch.scene.assets import Floats, ObjectAsset
 from advsearch.scene.description import SceneDescription

@@ -18,7 +18,8 @@ from torch import Tensor, nn
 
 from advsearch.errors import InputError, ModelError
 from advsearch.files import JsonValue
-from advsearch.models.reference import INPUT_SIZE, RECORD, WEIGHTS, Augmentation, ReferenceNet, build
+from advsearch.models.reference import INPUT_SIZE, RECORD, WEIGHTS, ReferenceNet, build
+from advsearch.questions.harden.networks import Augmentation
 
 WARM_UP = 0.05
 WEIGHT_DECAY = 0.05

@@ -10,9 +10,10 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from functools import wraps
+from pathlib import Path
 from typing import Any, TypeVar
 
 from torch import nn
@@ -166,6 +167,15 @@ def _docstring(text: str, names: Sequence[str], command: str, settings: Sequence
     told = {one.partition(":")[0]: one.rstrip() for one in re.split(r"(?m)^(?=\w+: )", textwrap.dedent(own)) if one}
     listed = [told.get(name, f"{name}: {SAME.get(name)}") for name in names] + [*settings]
     return f"{said}\n\nArgs:\n{textwrap.indent(chr(10).join(listed), '    ')}\n\nRaises:\n    {RAISED}"
+
+
+def name_loaded(settings: Mapping[str, Any], python_arguments: Collection[str]) -> dict[str, Any]:
+    """Return settings with the name of a loaded model in its place, where the model is passed beside them too."""
+    named = dict(settings)
+    if "model" in python_arguments and "model" in named and not isinstance(named["model"], (str, Path)):
+        check_not_spread(named)
+        named["model"] = model_name(named["model"])
+    return named
 
 
 def configured(config: type[Made], **given: object) -> Made:

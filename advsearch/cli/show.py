@@ -20,7 +20,7 @@ from advsearch.cli.output import at_work, raw
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 from advsearch.options import declared_options, default_of, type_of
-from advsearch.registry import Registry, get_first_doc_line, imported
+from advsearch.registry import EXPERIMENTS, Registry, get_experiment, get_first_doc_line, imported
 from advsearch.report.wording import count, interval_text
 from advsearch.runs.directory import IMAGES, PHOTOGRAPHS, find_run
 from advsearch.runs.listing import Listed, listed_run
@@ -53,13 +53,9 @@ def show(args: argparse.Namespace) -> int:
     match args.what:
         case ["control" | "policy" | "task" as kind, name]:
             return _show_declared(kind, name, args.json)
-        case ["recipe", name]:
-            from advsearch.questions.recipe.description import read_recipe, recipe_yaml  # works without that room
-
-            text = recipe_yaml(name)
-            return output.say(
-                args.json, {"recipe": name, **read_recipe(name).model_dump(mode="json")}, text.rstrip("\n")
-            )
+        case [command, name] if command in EXPERIMENTS and (target := get_experiment(command).choice_description):
+            text, facts = imported(target)(name)
+            return output.say(args.json, {command: name, **facts}, text)
         case [name]:
             try:
                 return show_run(name, args.json, picture=args.picture)

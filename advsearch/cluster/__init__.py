@@ -12,6 +12,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from advsearch.errors import ClusterError
 from advsearch.files import JsonObject
 from advsearch.trust.code import allowed_code
 
@@ -42,6 +43,16 @@ class BatchResult:
     worker: str = ""  # who did it; empty in this process
     machine: str | None = None  # by its name in `WorkerStats.machines`; None where it is like this one
     lost: str = ""  # why nothing came back, only of a single item
+
+    def require_value(self, title: str) -> Any:
+        """Return what the call returned.
+
+        Raises:
+            ClusterError: nothing came back; `title` says what was given out.
+        """
+        if self.lost:
+            raise ClusterError(f"{title}: {self.lost}")
+        return self.value
 
 
 @dataclass

@@ -30,9 +30,9 @@ from advsearch.controls.support.images import PRINT_SIDE, enlarged
 from advsearch.controls.support.norms import NORMS, radius
 from advsearch.controls.support.picture_control import PictureControl
 from advsearch.errors import InputError
-from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.color import srgb_to_linear, to_8_bit
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import METERED_WHITE, WHITE, metered_gain, to_8_bit
+from advsearch.scene.formation import METERED_WHITE, WHITE, metered_gain
 from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middle
 from advsearch.scene.gradients import WHOLE_RANGE, Budget
 from advsearch.scene.parts import ProjectorPart

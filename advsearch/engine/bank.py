@@ -20,7 +20,7 @@ from advsearch.attacks.policies.sampling import to_domain
 from advsearch.engine.acceptance import ComparedView
 from advsearch.engine.transport import PredictedSearch
 from advsearch.runs.results import BankOfConditions
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.color import to_8_bit
 from advsearch.scene.predictor import MOST_BYTES
 from advsearch.scene.transport.matrix import LinearRenderer, Tick
 from advsearch.trust.stored_files import scaled

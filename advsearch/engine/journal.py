@@ -32,7 +32,7 @@ from advsearch.models import Model
 from advsearch.models.address import AskedModel
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
-from advsearch.scene.formation import levels_of
+from advsearch.scene.color import levels_of
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.together import Ensemble
 

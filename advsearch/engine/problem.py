@@ -33,10 +33,11 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import Value
 from advsearch.runs.results import GroupDerivative, PlannedGradient
+from advsearch.scene.color import to_8_bit
 from advsearch.scene.description import NO_MAP
-from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients import GradientPlan
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.lights import why_not
 from advsearch.scene.transport.matrix import Linearised, LinearRenderer, linear_inputs
 from advsearch.tasks import Facts, Judgement, Mark, Task
 from advsearch.tasks.base import Output, Truth, mean, typical
@@ -123,6 +124,12 @@ class Problem:
     def environment(self) -> str:
         scene = self.space.scene
         return self.space.environment or (NO_MAP if scene is None else scene.environment_name)
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether matrices of light transport tell the images of what is searched (`linearised`)."""
+        by_chance = self.space.controls[self.searched :]
+        return why_not(self.renderer, [control.name for control in by_chance]) is None
 
     @property
     def rule(self) -> Rule:

@@ -25,8 +25,9 @@ from advsearch.report.figures import contact_sheet, marked
 from advsearch.report.wording import seen_text
 from advsearch.runs.files import png_bytes, write_exr, write_layers, write_png
 from advsearch.runs.results import Formation, MeshUp, RenderResult, ViewPredictions
+from advsearch.scene.color import to_8_bit
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import SAMPLER, ImageFormation, Surfaces, to_8_bit
+from advsearch.scene.formation import SAMPLER, ImageFormation, Surfaces
 from advsearch.scene.outlines import seen_things
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import ORBIT_CAMERA

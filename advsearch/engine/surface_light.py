@@ -19,7 +19,7 @@ from advsearch.engine.bank import stratified
 from advsearch.engine.problem import Problem
 from advsearch.engine.transport import PredictedSearch
 from advsearch.runs.results import BankOfConditions
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.color import to_8_bit
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.surface import renderer as surface_renderer

@@ -22,7 +22,7 @@ from advsearch.attacks.evaluation import Query
 from advsearch.engine.acceptance import ComparedView, Deviation, compared
 from advsearch.engine.problem import Problem
 from advsearch.runs.results import BankOfConditions, LinearTransport, PredictionError
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.color import to_8_bit
 from advsearch.scene.predictor import Predictor, Refusal, RefusalCause
 from advsearch.scene.transport.lights import lights_to_collect, predicting, samples_to_collect, why_not
 from advsearch.scene.transport.matrix import Tick

@@ -29,14 +29,15 @@ from advsearch.cluster import Workers
 from advsearch.config import SceneConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import KEPT, Findings, Stages
+from advsearch.engine.record import KEPT, Findings
 from advsearch.engine.transport import PredictedSearch
 from advsearch.errors import InputError
-from advsearch.progress import Progress
+from advsearch.progress import Progress, Stages
 from advsearch.report.wording import count as plural
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_configuration
-from advsearch.scene.formation import next_count, to_8_bit
+from advsearch.scene.color import to_8_bit
+from advsearch.scene.formation import next_count
 from advsearch.tasks import Judgement
 
 MANY = 64  # of a configuration with more numbers than this, a trial's row does not hold the values

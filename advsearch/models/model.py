@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from typing import Any, final
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
@@ -61,6 +62,8 @@ def recomputed(ask: Callable[[Tensor], Any], images: Tensor) -> Any:
 
 
 CPU = torch.device("cpu")
+PROGRAMS = (torch.fx.GraphModule, torch.jit.ScriptModule)
+"""What exported and scripted networks are, which are run as they are: they are not copied, and not trained."""
 
 Triple = tuple[float, float, float]
 
@@ -160,6 +163,8 @@ class Model:
         asked: what `load_model` was given, where that says all of it; None for what exists in this session only.
         cameras: how many pictures are side by side in each image, which the network is shown one by one; the output is
             then a list with a tuple of theirs for each image.
+        make_trainable: returns a new network with the same weights that can be trained further, where `module` is one
+            made for inference alone; None for a copy of `module`.
     """
 
     module: Callable[[Tensor], Any] = field(repr=False)
@@ -176,6 +181,7 @@ class Model:
     read: Read | None = field(default=None, repr=False)
     asked: str | None = field(default=None, repr=False)
     cameras: int = 1
+    make_trainable: Callable[[], nn.Module] | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         height, width = self.input_size
@@ -229,6 +235,29 @@ class Model:
         each = [output[number : number + 1] for number in range(len(output))]
         return [tuple(each[begin : begin + self.cameras]) for begin in range(0, len(each), self.cameras)]
 
+    def copy_network(self) -> nn.Module:
+        """Return a copy of the network, to train it further.
+
+        Raises:
+            ModelError: there is none, as of an exported program.
+        """
+        if self.make_trainable is not None:
+            return self.make_trainable()
+        if not isinstance(self.module, nn.Module) or isinstance(self.module, PROGRAMS):
+            raise ModelError(
+                f"model {self.name}: an exported program cannot be trained; name the code that builds the network "
+                "(package.module:callable@weights.safetensors), or give an nn.Module from Python"
+            )
+        return copy.deepcopy(self.module)
+
+    def with_network(self, network: nn.Module) -> Model:
+        """Return the same model with a network of the same kind, whose weights it shares, in evaluation mode.
+
+        It sees the weights as they are trained in place, and collects no gradients for them.
+        """
+        shared = sharing_copy(network).eval().requires_grad_(False)
+        return replace(self, module=shared, make_trainable=None)
+
     def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
         """Return the classes that `text` names, e.g. ``"coffee mug,cup"`` or ``"#504"``; see `find_label_set`."""
         return find_label_set(text, self.labels, named=self.named)
@@ -256,6 +285,18 @@ class Model:
             return read_by(self.read, returned, len(x), self.name)
         logits = logits_of(returned, len(x), len(self.labels), self.name)
         return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
+
+
+def sharing_copy(module: nn.Module) -> nn.Module:
+    """Return a copy that has the same weights, but gradients of its own. Weights that were made in
+    `torch.inference_mode` are copied: nothing can be differentiated through them."""
+
+    def usable(weights: torch.Tensor) -> torch.Tensor:
+        return weights.clone() if weights.is_inference() else weights
+
+    memo: dict[int, Any] = {id(p): nn.Parameter(usable(p.detach()), p.requires_grad) for p in module.parameters()}
+    memo.update({id(buffer): usable(buffer) for buffer in module.buffers()})
+    return copy.deepcopy(module, memo)
 
 
 DETACHING = (torch.Tensor.detach, torch.Tensor.detach_, torch.detach, torch.detach_)

@@ -16,7 +16,7 @@ from advsearch.errors import ModelError
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
 from advsearch.models.labels import fitting_labels
-from advsearch.models.model import Detaching, Model, logits_of, read_by, tensors_in, warn
+from advsearch.models.model import PROGRAMS, Detaching, Model, logits_of, read_by, tensors_in, warn
 from advsearch.trust.foreign_code import TookTooLong, first_line, within
 from advsearch.trust.stored_files import FACTOR, scaled
 
@@ -50,7 +50,6 @@ EIGHT_BIT = (0.0, 255.0)  # the other range of colours that networks are made fo
 
 SMALLEST = 1e-5  # smallest change that is looked at, as a share of the outputs: what is less may be rounding
 
-PROGRAMS = (torch.fx.GraphModule, torch.jit.ScriptModule)
 """What torch makes of a model file. Others that are made of one have a method `stop`, which ends what they run."""
 
 LARGEST = 1 << 26  # pixels of all the images that a network takes at once, at least: 800 MB of numbers

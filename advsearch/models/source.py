@@ -26,8 +26,7 @@ from torch.nn.parameter import is_lazy
 
 from advsearch.errors import FileFormatError, InputError, ModelError, UnknownNameError, resembling
 from advsearch.models.inputs import takes_image_size
-from advsearch.models.model import CPU, GIVEN_BY, Model, Triple, warn
-from advsearch.models.probe import PROGRAMS
+from advsearch.models.model import CPU, GIVEN_BY, PROGRAMS, Model, Triple, sharing_copy, warn
 from advsearch.trust.archives import LARGEST
 from advsearch.trust.code import check_import, current_directory_importable
 from advsearch.trust.foreign_code import first_line
@@ -139,18 +138,6 @@ def frozen(module: nn.Module, name: str) -> nn.Module:
     for parameter in module.parameters():
         parameter.requires_grad_(False)
     return module
-
-
-def sharing_copy(module: nn.Module) -> nn.Module:
-    """Return a copy that has the same weights, but gradients of its own. Weights that were made in
-    `torch.inference_mode` are copied: nothing can be differentiated through them."""
-
-    def usable(weights: torch.Tensor) -> torch.Tensor:
-        return weights.clone() if weights.is_inference() else weights
-
-    memo: dict[int, Any] = {id(p): nn.Parameter(usable(p.detach()), p.requires_grad) for p in module.parameters()}
-    memo.update({id(buffer): usable(buffer) for buffer in module.buffers()})
-    return copy.deepcopy(module, memo)
 
 
 def load_weights(module: nn.Module, path: Path, name: str) -> None:

@@ -226,6 +226,10 @@ class RunDirectory:
         """Return the parts of a run that existed only in the Python session that made it."""
         return read_python_only(Path(run))
 
+    def record_row(self, kind: str, step: int, **columns: Any) -> None:
+        """Add one evaluated configuration to the results; `columns` are those of `store.Row`."""
+        self.record(store.Row(kind, step, **columns))
+
     @staticmethod
     def locate_part(run: Path, name: str) -> Path:
         """Return the folder of a part of a run, whether it exists or not."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
-from advsearch.options import Value
+from advsearch.options import OUT_OF_VIEW, Value
 from advsearch.runs.files import SCHEMA, check_version, connect_to_write
 from advsearch.runs.results import plain
 from advsearch.trust.databases import DAMAGED, check_schema, connect_to_read, readable
@@ -61,6 +61,11 @@ class Row:
     machine: str | None = None
     time: float | None = None
     id: int | None = None
+
+    @property
+    def is_out_of_view(self) -> bool:
+        """Whether the object could not be seen in the image, so that nothing was predicted."""
+        return self.label == OUT_OF_VIEW
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The sRGB encoding and its inverse, for numpy arrays and torch tensors (IEC 61966-2-1)."""
+"""The sRGB encoding and its inverse, for numpy arrays and torch tensors (IEC 61966-2-1), and its 8-bit levels."""
 
 from __future__ import annotations
 
@@ -31,3 +31,13 @@ def linear_to_srgb(linear: Values) -> Values:
     if isinstance(linear, np.ndarray):
         return np.where(low_end, low, curve).astype(np.float32)
     return low.where(low_end, curve)
+
+
+def levels_of(display: Tensor) -> Tensor:
+    """Return the levels (uint8) that an 8-bit file has for values in [0, 1]; not differentiable."""
+    return (display.detach() * 255.0).round().byte()
+
+
+def to_8_bit(display: Tensor) -> Tensor:
+    """Round to the 256 levels of an 8-bit file and return the values in [0, 1]; not differentiable."""
+    return (display.detach() * 255.0).round() / 255.0

@@ -103,16 +103,6 @@ class _Shown(torch.autograd.Function):
         return torch.where(inside, slope, 0.0).mul_(ctx.gain), None
 
 
-def levels_of(display: Tensor) -> Tensor:
-    """Return the levels (uint8) that an 8-bit file has for values in [0, 1]; not differentiable."""
-    return (display.detach() * 255.0).round().to(torch.uint8)
-
-
-def to_8_bit(display: Tensor) -> Tensor:
-    """Round to the 256 levels of an 8-bit file and return the values in [0, 1]; not differentiable."""
-    return (display.detach() * 255.0).round() / 255.0
-
-
 @lru_cache(maxsize=64)
 def next_count(sampler: str, samples: float) -> int:
     """Return the number of samples that a sampler takes when it is asked for at least so many. Independent samples come

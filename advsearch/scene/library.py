@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from importlib import resources
 from os import PathLike
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,6 +50,8 @@ def finished(mesh: Mesh, finishes: Mapping[str, Material], main: Material) -> di
 
 if TYPE_CHECKING:
     from importlib.abc import Traversable
+
+    from advsearch.scene.people import Person
 
 BUNDLED_OBJECT = "bundled object"  # source of an object that is bundled, or another member of its family
 BUNDLED_ENVIRONMENT = "bundled environment"  # source of an environment that is bundled
@@ -98,9 +101,7 @@ def load_object(name: str) -> ObjectAsset:
         )
         mesh = Mesh(places, faces.reshape(-1, 3).astype(np.uint32), normals, uvs, materials=materials)
         if (folder / "body.npz").is_file():
-            from advsearch.scene.people import Person, body_data  # torch takes seconds, and most have no body
-
-            mesh = replace(mesh, rig=Person(body_data()))
+            mesh = replace(mesh, rig=make_person())
         levels = np.asarray(iio.imread((folder / "base_color.png").read_bytes(), extension=".png"))[..., :3]
         material = Material(**facts["material"])
         finishes = {finish: Material(**numbers) for finish, numbers in facts.get("finishes", {}).items()}
@@ -118,6 +119,13 @@ def load_object(name: str) -> ObjectAsset:
         )
     except (OSError, ValueError, KeyError, TypeError, FileFormatError) as error:
         raise FileFormatError(f"bundled object {name!r} cannot be read ({error}); reinstall advsearch") from error
+
+
+def make_person(defaults: Mapping[str, float] = MappingProxyType({})) -> Person:
+    """Return the bundled body, with other defaults of the control `body` such as ``{"height": 1.8}``."""
+    from advsearch.scene.people import Person, body_data  # torch takes seconds, and most objects have no body
+
+    return Person(body_data(), defaults)
 
 
 def load_environment(name: str) -> EnvironmentAsset:

@@ -28,8 +28,9 @@ from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.pictures import png_of
 from advsearch.scene.assembly import ON_PICTURE, Motion, central
+from advsearch.scene.color import levels_of
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.formation import ImageFormation, Later, Moment, Surfaces, levels_of
+from advsearch.scene.formation import ImageFormation, Later, Moment, Surfaces
 from advsearch.scene.geometry import camera_to_world, middle
 from advsearch.scene.gradients import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, Group, first_order, first_plan, steps_for
 from advsearch.scene.mitsuba_backend.denoise import denoise

@@ -1,6 +1,7 @@
 """Statistics of counts and shares: intervals, sequential rules, paired and clustered tests.
 
-Pure functions of numbers and arrays, each with its source. Nothing here knows a run, a trial or a drive.
+Pure functions of numbers and arrays, each with its source. Nothing here knows a run, a trial or a drive. A module is
+imported when it is first used, since scipy takes long.
 """
 
 from __future__ import annotations

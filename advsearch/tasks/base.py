@@ -22,7 +22,7 @@ from advsearch.copies import hand_copies
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
-from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW
+from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW, Outcome, get_outcome
 
 Output = Any  # what a model returns for N pictures: a tensor (N, ...), or a list with one thing for each picture
 Truth = Any  # what is true of a scene, as its task needs it: the right classes, a number, boxes
@@ -84,6 +84,11 @@ class Judgement:
     def success(self) -> bool:
         """Whether the output is what is sought."""
         return self.score > 0.0
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """What becomes of the object; None where the task does not say it."""
+        return get_outcome(self.payload)
 
     @property
     def not_a_number(self) -> bool:

@@ -36,8 +36,7 @@ from advsearch.files import JsonObject
 from advsearch.models import load_model
 from advsearch.models.model import Model, Preprocessing
 from advsearch.questions.stability.scenes import condition_number, hessian
-from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.color import linear_to_srgb, to_8_bit
 from advsearch.tasks import Classification, Judgement, Prediction
 
 LABELS, IMAGE = (0,), torch.zeros(1, 2, 2, 3)

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from advsearch.bundled.objects import HOUSEHOLD, OBJECTS, STREET
-from advsearch.bundled.objects.shapes import carved, grid
-from advsearch.bundled.objects.textures import Draw
 from advsearch.errors import UnknownNameError
+from advsearch.questions.harden.objects import HOUSEHOLD, OBJECTS, STREET
+from advsearch.questions.harden.objects.shapes import carved, grid
+from advsearch.questions.harden.objects.textures import Draw
 from advsearch.scene import library
 from advsearch.scene.assets import Mesh, ObjectAsset, normalised
 from scenes import build, files

@@ -22,7 +22,7 @@ from advsearch.engine.surface_light import refusal_of_surface_light
 from advsearch.errors import InputError, ModelError
 from advsearch.experiment import Experiment
 from advsearch.models import Model
-from advsearch.models.reference import Trainable, copied_network, load
+from advsearch.models.reference import load
 from advsearch.progress import NullProgress
 from advsearch.questions.attack.carry_out import executor_for, problem_of
 from advsearch.questions.attack.settings import AttackConfig
@@ -31,6 +31,7 @@ from advsearch.questions.harden import harden as asked
 from advsearch.questions.harden import scenes as harden_scenes
 from advsearch.questions.harden import training
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson
+from advsearch.questions.harden.networks import Trainable
 from advsearch.questions.harden.result import QUICK, HardenConfig
 from advsearch.questions.harden.rounds import ROUNDS, Rounds, Score
 from advsearch.questions.harden.scenes import FURTHER, TRAINING, VALIDATION, SceneWork, Wanted
@@ -165,7 +166,7 @@ def test_a_measurement_over_viewpoints_may_be_predicted() -> None:
 @pytest.mark.slow
 def test_workers_do_what_this_process_does(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**{**SMALL, "model": "reference", "controls": "texture,pose", "epsilon": {"texture": 0.03}})
-    weights = safetensors.save(copied_network(load()).state_dict())
+    weights = safetensors.save(load().copy_network().state_dict())
     looking = partial(SceneWork.looked_at, number=0, weights=weights)
     wanted = [drawing(1, "texture", plain=1), drawing(0, "pose"), looking]
     here = SceneWork(config, load(), harden_scenes.splits_of(config, load()))(wanted)

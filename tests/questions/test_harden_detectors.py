@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.models.reference import trainable
 from advsearch.questions.harden.detectors import DetectorCourse, Example, own_loss, read_coco
+from advsearch.questions.harden.networks import trainable
 from advsearch.questions.harden.result import HardenConfig
 from advsearch.questions.harden.scenes import SceneWork
 from advsearch.runs.files import write_png

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.errors import InputError
-from advsearch.models.reference import trainable
 from advsearch.questions.harden.detectors import Example, SegmenterCourse, pixel_loss
+from advsearch.questions.harden.networks import trainable
 from advsearch.questions.harden.result import HardenConfig
 from advsearch.questions.harden.scenes import SceneWork
 from advsearch.tasks import make_task

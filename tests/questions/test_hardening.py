@@ -18,17 +18,16 @@ import torch
 from small_models import Colours
 from torch import Tensor, nn
 
-from advsearch import threads
 from advsearch.attacks import Block, Domain
-from advsearch.bundled.changed_light import white_light_changed
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
-from advsearch.models.reference import Trainable, trainable
 from advsearch.questions.attack.carry_out import problem_of
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden.carry_out import _share
+from advsearch.questions.harden.changed_light import white_light_changed
 from advsearch.questions.harden.lessons import (
+    PICTURES,
     Lesson,
     RenderedLesson,
     TextureLesson,
@@ -38,6 +37,7 @@ from advsearch.questions.harden.lessons import (
     surprise,
     tried,
 )
+from advsearch.questions.harden.networks import Trainable, one_thread_each, trainable
 from advsearch.questions.harden.result import HardenConfig, TrainingRound
 from advsearch.questions.harden.rounds import Rounds, Score, warm_up_fraction
 from advsearch.questions.harden.scenes import (
@@ -50,7 +50,8 @@ from advsearch.questions.harden.scenes import (
     fingerprint,
 )
 from advsearch.questions.harden.training import ClassifierCourse, Gradients
-from advsearch.scene.formation import levels_of, to_8_bit
+from advsearch.runs.directory import RunDirectory
+from advsearch.scene.color import levels_of, to_8_bit
 from advsearch.scene.library import load_environment
 from advsearch.statistics.intervals import clopper_pearson
 
@@ -318,7 +319,7 @@ def test_the_given_model_is_asked_about_scenes_as_they_are_alone() -> None:
         return student().logits(images).detach()
 
     plain = [Lesson((n,), levels_of(coloured(n, 0.4, n))) for n in range(3)]
-    with threads.one_each_for_torch() as pool:
+    with one_thread_each() as pool:
         for batch, count in (([*pupils(), *plain], 3), (pupils(), 0)):
             Gradients(student(), cast(Any, given), pool).take(batch, None, 0)
             assert sum(len(one) for one in asked) == count
@@ -371,7 +372,7 @@ def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pyt
 
     monkeypatch.setattr("advsearch.questions.harden.training._changed", changed)
     made = student()
-    with threads.one_each_for_torch() as pool:
+    with one_thread_each() as pool:
         Gradients(made, student().model, pool).take(batch, None, 7)
     searched = sorted(one[:2] for one in seen if one[2])
     trained = sorted(one[:2] for one in seen if not one[2])
@@ -395,14 +396,16 @@ def test_a_round_takes_the_users_optimiser_and_their_batches() -> None:
 
 
 def test_pictures_are_a_folder_for_each_class_and_a_webdataset(tmp_path: Path) -> None:
-    save_pictures(tmp_path / "pictures", 1, pupils()[:2], ["wine glass", "mug"])
-    assert sorted(one.relative_to(tmp_path / "pictures").as_posix() for one in tmp_path.glob("pictures/*/*")) == [
+    with RunDirectory.create(tmp_path / "run") as run:
+        save_pictures(run, 1, pupils()[:2], ["wine glass", "mug"])
+    pictures = tmp_path / "run" / PICTURES
+    assert sorted(one.relative_to(pictures).as_posix() for one in pictures.glob("*/*")) == [
         "0000-wine-glass/001-00000-plain.png",
         "0000-wine-glass/001-00000-worst.png",
         "0001-mug/001-00001-plain.png",
         "0001-mug/001-00001-worst.png",
     ]
-    with tarfile.open(tmp_path / "pictures.tar") as tar:
+    with tarfile.open(pictures.with_suffix(".tar")) as tar:
         names = tar.getnames()
         assert [name.rpartition(".")[2] for name in names] == ["png", "cls", "json"] * 4
         assert len({name.partition(".")[0] for name in names}) == 4

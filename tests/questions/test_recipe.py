@@ -17,7 +17,6 @@ from advsearch.cli.main import main
 from advsearch.engine.surface_light import refusal_of_surface_light
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.experiment import run_experiment
-from advsearch.questions.attack import studies
 from advsearch.questions.attack.carry_out import parts_of, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import FoundValue, SearchDistribution
@@ -333,7 +332,7 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
         done.append(config.object)
         return real(config, **named)
 
-    monkeypatch.setattr(studies, "run_experiment", stopping)
+    monkeypatch.setattr("advsearch.experiment.run_experiment", stopping)
     with pytest.raises(KeyboardInterrupt):
         advsearch.recipe(path, run=run)
     path.unlink()  # it goes on as it began

@@ -13,9 +13,9 @@ from torch import Tensor
 from advsearch.controls import TextureControl, make_space
 from advsearch.engine.loading import load_scene, make_renderer
 from advsearch.errors import InputError
-from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear, to_8_bit
 from advsearch.scene.description import describe
-from advsearch.scene.formation import EVERYTHING, ImageFormation, to_8_bit
+from advsearch.scene.formation import EVERYTHING, ImageFormation
 from advsearch.scene.mitsuba_backend.scene import BASE_COLOR, MitsubaScene
 from advsearch.scene.renderer import Renderer
 

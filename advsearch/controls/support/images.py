@@ -11,8 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch.controls.corruption_filters import picture, planes, resized
-from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.formation import levels_of
+from advsearch.scene.color import levels_of, linear_to_srgb, srgb_to_linear
 
 PRINT_SIDE = 512  # least side of the picture that is kept for printing, in pixels
 

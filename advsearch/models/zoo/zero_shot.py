@@ -15,8 +15,8 @@ from torch.nn import functional
 
 from advsearch.errors import InputError, ModelError
 from advsearch.models.labels import patterns
-from advsearch.models.model import warn
-from advsearch.models.source import Source, sharing_copy
+from advsearch.models.model import sharing_copy, warn
+from advsearch.models.source import Source
 from advsearch.models.zoo.library import Adapted, Ask, Loaded, in_pixels, nearly
 from advsearch.trust.foreign_code import foreign
 

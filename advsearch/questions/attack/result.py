@@ -33,8 +33,8 @@ from advsearch.runs import files, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.scene.assembly import posed
 from advsearch.scene.assets import Shape, simpler
+from advsearch.scene.color import to_8_bit
 from advsearch.scene.description import OBJECT
-from advsearch.scene.formation import to_8_bit
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import web_glb
 from advsearch.scene.settings import Given

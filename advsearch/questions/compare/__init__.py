@@ -104,7 +104,7 @@ def compare(asked: RunContext[CompareConfig]) -> CompareResult:
             `object`, names of models, which are shown it first.
     """
     # these import torch and pandas
-    from advsearch.questions.attack.studies import carry_out_part
+    from advsearch.experiment import run_part as carry_out_part
     from advsearch.questions.compare.pairs import PairPictures, compared, differing, read_sides
     from advsearch.rules import interval_of, share_of
     from advsearch.runs.tables import count_wrong_outcomes

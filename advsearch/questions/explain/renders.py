@@ -19,11 +19,11 @@ from advsearch import seeds
 from advsearch.controls import CONTROLS, Parameter
 from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.experiment import RunContext
+from advsearch.experiment import run_part as carry_out_part
 from advsearch.interrupts import interruptible
 from advsearch.models.features import Features, features_of
 from advsearch.options import BY_KEY
 from advsearch.progress import Progress
-from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.explain.findings import find_clusters, right_of
 from advsearch.questions.explain.result import Confirmation, FailureCluster, FailureClusters, NearestRight
 from advsearch.questions.sweep.carry_out import scenes_of

@@ -11,30 +11,15 @@ from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
-from advsearch import seeds
-from advsearch.api.keywords import asks, configured
-from advsearch.engine.journal import check_made_of
-from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
-from advsearch.engine.record import Stages
-from advsearch.errors import InputError, ModelError
-from advsearch.experiment import RunContext
-from advsearch.models.reference import trainable
-from advsearch.models.source import split_weights
-from advsearch.progress import Watched, watcher
-from advsearch.questions.attack.carry_out import LOADING, executor_for
+from advsearch.extend import InputError, ModelError, RunContext, RunDirectory, results, seeds, statistics, workbench
 from advsearch.questions.harden import scenes
 from advsearch.questions.harden.detectors import DetectorCourse, Loss, SegmenterCourse, read_coco
+from advsearch.questions.harden.lessons import PICTURES
+from advsearch.questions.harden.networks import trainable
 from advsearch.questions.harden.result import HardenConfig, HardenedControl, HardenResult, Share, SplitSide
-from advsearch.questions.harden.rounds import PICTURES, WEIGHTS, Course, MakeOptimiser, Rounds
+from advsearch.questions.harden.rounds import WEIGHTS, Course, MakeOptimiser, Rounds
 from advsearch.questions.harden.scenes import FURTHER, HELD_OUT, ROBUST, TRAINING, VALIDATION, SceneWork
 from advsearch.questions.harden.training import ClassifierCourse, Examples
-from advsearch.registry import get_experiment
-from advsearch.runs.directory import ARTIFACTS, RunDirectory, is_run, run_path
-from advsearch.runs.results import SharedWork
-from advsearch.runs.store import Row
-from advsearch.statistics.clustered import share_interval
-from advsearch.statistics.paired import mcnemar
-from advsearch.tasks import make_task
 
 MEANS = "means"  # the note of what a training has from Python
 MEASUREMENTS = {
@@ -53,58 +38,24 @@ COURSES: Mapping[str, Callable[..., Course]] = {
 }
 
 
-@asks(HardenConfig)
-def harden(
-    model: AnyModel = "reference",
-    *,
-    optimiser: MakeOptimiser | None = None,
-    beside: Examples | None = None,
-    loss: Loss | None = None,
-    resume: bool = False,
-    progress: Watched = None,
-    **settings: Any,
-) -> HardenResult:
-    """Train a copy of a model on its worst cases, and prove what it is better at (docs/harden.md).
-
-    All other arguments are the settings of `advsearch harden`. The run is kept, in `run` or under runs/. The model that
-    is given stays as it is.
-
-    Args:
-        model: a classifier, a detector or a segmenter: what `load_model` takes, and no exported program.
-        optimiser: makes one of the list of parameters, such as ``lambda p: torch.optim.SGD(p, 0.01)``; its learning
-            rate is then the highest, in place of `rate`.
-        beside: batches of further examples, such as a `DataLoader`: images (N, H, W, 3) sRGB in [0, 1], class indices
-            (N,). One is taken with each step. Not of a detector, which `data` is for.
-        loss: of a detector whose network returns none in training: a function of the network, its input (N, 3, H, W)
-            and, for each picture, a mapping with "boxes" (K, 4), x0, y0, x1, y1 in pixels of that input, and "labels"
-            (K,), indices of the model's labels; of a segmenter with "classes" (h, w) int64, the class that each pixel
-            of its output should have, and "object" (h, w) bool, those of the object. It returns a number that is
-            smaller where the network is better.
-        resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
-            was.
-    """
-    if not isinstance(model, (str, Path)):
-        check_not_spread(settings)
-    config = configured(HardenConfig, model=model_name(model), **settings)
-    path = run_path(config.run) if resume and config.run is not None else None
-    resumed = path if path is not None and is_run(path) else None
-    given = {"model": model, "optimiser": optimiser, "beside": beside, "loss": loss}
-    result: HardenResult = get_experiment("harden").run(config, progress=watcher(progress), resumed=resumed, **given)
-    return result
-
-
 def hardened(
     asked: RunContext[HardenConfig],
     *,
-    model: AnyModel | None = None,
+    model: Any = None,
     optimiser: MakeOptimiser | None = None,
     beside: Examples | None = None,
     loss: Loss | None = None,
 ) -> HardenResult:
-    """Do what a configuration describes, or go on with it; see `harden`. None takes the configuration's model."""
+    """Harden a model as the settings say, or continue a run that was stopped.
+
+    Args:
+        asked: the settings and the run.
+        model: a loaded one in place of the one that the settings name.
+        optimiser, beside, loss: as for `advsearch.harden`.
+    """
     config = asked.config
-    asked.progress.stage(LOADING)
-    check_run_settings(config)
+    asked.progress.stage(workbench.LOADING)
+    workbench.check_run_settings(config)
     kind, classifies = config.task_name, config.task_name == "classification"
     refused = {
         "task: harden trains for classification, detection and segmentation; `data` is of detection, and `loss` of "
@@ -117,7 +68,8 @@ def hardened(
         if wrong:
             raise InputError(text)
     try:
-        (loaded, *_), warnings = load_models([model or config.model], make_task(config.task), config)
+        task = workbench.make_task(config.task)
+        (loaded, *_), warnings = workbench.load_models([model or config.model], task, config)
     except ModelError as error:
         if not classifies:
             raise
@@ -137,11 +89,12 @@ def hardened(
                 f"{asked.run.path}: cannot resume: it began {'with' if was else 'without'} `{name}`, which only Python "
                 "gives; resume it with advsearch.harden(..., run=..., resume=True) and the same arguments"
             )
-    check_made_of(asked.run, [loaded])
+    workbench.check_made_of(asked.run, [loaded])
     run = Hardening(asked.run, course)
+    worker = "advsearch.questions.harden.scenes:scenes_of"
     with asked.until_interrupted():
-        with executor_for(config, "advsearch.questions.harden.scenes:scenes_of", asked.progress) as work.executor:
-            run.carry_out()
+        with workbench.executor_for(config, worker, asked.progress) as work.executor:
+            run.carry_out(asked)
     return run.result(asked, warnings)
 
 
@@ -150,7 +103,7 @@ class Hardening:
 
     def __init__(self, run: RunDirectory, course: Course) -> None:
         self.run, self.course, self.scenes, self.config = run, course, course.work, course.config
-        self.rounds, self.stages = Rounds(run, course), Stages(course.work.progress)
+        self.rounds = Rounds(run, course)
         self.wrong = {(row.kind, row.step): bool(row.success) for row in run.store.rows()}
         self.clean: Mapping[str, list[bool]] = {}
         self.outcomes: Mapping[str, dict[str, int]] = {}
@@ -159,8 +112,11 @@ class Hardening:
             TRAINING: searched, FURTHER: course.further * searched, VALIDATION: self.rounds.judged, HELD_OUT: held_out
         }  # fmt: skip
 
-    def carry_out(self) -> None:
-        sides, stages, weights = self.scenes.splits, self.stages, b""
+    def carry_out(self, asked: RunContext[HardenConfig]) -> None:
+        """Measure the model, train it, and measure it again; what is done is not done again."""
+        stages = asked.stages
+        sides = self.scenes.splits
+        weights = b""
         scenes.check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)])
         gc.freeze()  # as of `scenes_of`
         try:
@@ -168,7 +124,7 @@ class Hardening:
                 if which == "after":
                     stages.begin("training", "training")
                     self.rounds.carry_out()
-                    weights = (self.run.path / ARTIFACTS / WEIGHTS).read_bytes()
+                    weights = (self.run.path / WEIGHTS).read_bytes()
                 if "stronger" not in which:
                     stages.begin("measurement", MEASUREMENTS[which][0])
                 self._measure(which, weights or None)
@@ -202,7 +158,7 @@ class Hardening:
         for (control, number), wrong in chain(((key, True) for key in known), done):
             self.wrong[f"{which} {control}", number] = wrong
             seed = seeds.stream(self.config.seed, f"measured {control}", number)
-            self.run.record(Row(f"{which} {control}", number, seed=seed, spp=self.config.verify_spp, success=wrong))
+            self.run.record_row(f"{which} {control}", number, seed=seed, spp=self.config.verify_spp, success=wrong)
 
     def _robust(self, which: str, controls: Iterable[str]) -> list[bool] | None:
         """Whether each scene is robust to the searches over all of some controls; None where some are not known."""
@@ -221,12 +177,12 @@ class Hardening:
         if before is not None and after is not None:
             pairs = list(zip(before, after, strict=True))
             gained, lost = pairs.count((False, True)), pairs.count((True, False))
-            paired = {"gained": gained, "lost": lost, "p": mcnemar(gained, lost)}
+            paired = {"gained": gained, "lost": lost, "p": statistics.paired.mcnemar(gained, lost)}
         if done and self.rounds.best == 0:
             warnings = [*warnings, "No round kept the clean accuracy, so the weights are the model's own."]
-        artifacts, taught = self.run.path / ARTIFACTS, self.scenes.splits[TRAINING]
+        path, taught = self.run.path, self.scenes.splits[TRAINING]
         views = dict(zip(self.counts, (self.course.views[0], 1, self.course.views[1], scenes.CLEAN_VIEWS), strict=True))
-        name, _ = split_weights(config.model)
+        name = config.model.partition("@")[0].strip()
         facts = self.scenes.executor and self.scenes.executor.facts
         split = {
             side: SplitSide.of({**vars(each), "scenes": self.counts[side], "views": views[side]})
@@ -245,11 +201,11 @@ class Hardening:
             search=f"{config.policy_name}, {config.steps} steps",
             stronger_search=f"portfolio of pgd with restarts, cmaes and random, {scenes.TIMES * config.steps} steps",
             # a name with a colon is of code that makes it
-            hardened=f"{name}@{artifacts / WEIGHTS}" if done and (name == "reference" or ":" in name) else None,
-            weights=str(artifacts / WEIGHTS) if done else None,
-            pictures=str(artifacts / PICTURES) if done else None,
-            shared=SharedWork.of_facts(facts, facts.machines if facts else {}), warnings=warnings,
-            seconds=self.stages.seconds,
+            hardened=f"{name}@{path / WEIGHTS}" if done and (name == "reference" or ":" in name) else None,
+            weights=str(path / WEIGHTS) if done else None,
+            pictures=str(path / PICTURES) if done else None,
+            shared=results.SharedWork.of_facts(facts, facts.machines if facts else {}), warnings=warnings,
+            seconds=asked.stages.seconds,
         )  # fmt: skip
 
 
@@ -259,7 +215,7 @@ def _share(right: Sequence[bool] | None, views: int = 1, outcomes: Mapping[str, 
     if right is None:
         return None
     right_views = [sum(right[first : first + views]) for first in range(0, len(right), views)]
-    interval = share_interval(right_views, [views] * len(right_views))
+    interval = statistics.clustered.share_interval(right_views, [views] * len(right_views))
     accuracy = sum(right) / len(right)
     counts = dict(outcomes or {}) or None
     return Share(accuracy=accuracy, interval=interval, right=sum(right), count=len(right), outcomes=counts)

@@ -18,22 +18,23 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from advsearch import seeds
-from advsearch.engine.problem import Problem
-from advsearch.errors import FileFormatError, InputError, ModelError
-from advsearch.models import Model
-from advsearch.models.reference import Trainable
-from advsearch.pictures import upright
-from advsearch.questions.attack.carry_out import attack_on, problem_of
+from advsearch.extend import (
+    FileFormatError,
+    InputError,
+    Model,
+    ModelError,
+    Problem,
+    RunDirectory,
+    Task,
+    color,
+    seeds,
+    stored_files,
+    workbench,
+)
+from advsearch.questions.harden.lessons import PICTURES
+from advsearch.questions.harden.networks import Trainable
 from advsearch.questions.harden.rounds import Course, MakeOptimiser, Score, Take
 from advsearch.questions.harden.scenes import SceneWork
-from advsearch.runs.files import write_png
-from advsearch.scene.formation import levels_of
-from advsearch.tasks import Task, make_task
-from advsearch.tasks.boxes import Place
-from advsearch.tasks.segmentation import Region, Segmentation
-from advsearch.trust.stored_files import parse_json, read_text
-from advsearch.trust.writing import write_bytes
 
 Target = dict[str, Tensor]
 """What is in a picture: "boxes" (K, 4), x0, y0, x1, y1 in pixels of the network's input, and "labels" (K,) indices."""
@@ -55,18 +56,18 @@ class Example(NamedTuple):
     boxes: Tensor
     labels: Tensor
     task: Task | None = None
-    truth: Place | Region | None = None
+    truth: Any = None  # a `Place` of detection, or a `Region` of segmentation
     found: bool = False
 
     @classmethod
     def of(cls, problem: Problem, seed: int, u: Tensor | None = None) -> Example:
         """Render a configuration, or the scene as it is, with the conditions that a seed draws."""
         at = problem.domain.start if u is None else u
-        truth: Place | Region = problem.truth(problem.whole(at, seed))
-        box = truth.box if isinstance(truth, Place) else None
+        truth: Any = problem.truth(problem.whole(at, seed))
+        box = getattr(truth, "box", None)
         boxes = torch.tensor([box] if box else [], dtype=torch.float32).reshape(-1, 4)
         labels = torch.tensor([truth.labels[0]] * len(boxes), dtype=torch.int64)
-        return cls(levels_of(problem.picture(at, seed, SPP)), boxes, labels, problem.task, truth, u is not None)
+        return cls(color.levels_of(problem.picture(at, seed, SPP)), boxes, labels, problem.task, truth, u is not None)
 
     def right(self, model: Model) -> bool:
         assert self.task is not None
@@ -80,7 +81,7 @@ def read_coco(folder: Path, model: Model) -> list[Example]:
     is something else, or names files outside of it; an InputError where no category is one of the labels."""
     path, inside = folder / "annotations.json", (folder / "images").resolve()
     try:
-        coco: Any = parse_json(read_text(path, "a COCO file", LARGEST))
+        coco: Any = stored_files.parse_json(stored_files.read_text(path, "a COCO file", LARGEST))
         known = [kind for kind in coco["categories"] if str(kind["name"]) in model.labels]
         indices = {kind["id"]: model.labels.index(str(kind["name"])) for kind in known}
         things = defaultdict[Any, list[Any]](list)
@@ -95,14 +96,14 @@ def read_coco(folder: Path, model: Model) -> list[Example]:
             file = inside / name
             if name.is_absolute() or ".." in name.parts or file.is_symlink() or inside not in file.resolve().parents:
                 raise FileFormatError(f"{path}: expected names of files in images/, got {str(name)[:100]}")
-            picture = torch.from_numpy(upright(file, LARGEST_SIDE))
+            picture = torch.from_numpy(workbench.upright(file, LARGEST_SIDE))
             if picture.shape[:2] != (image["height"], image["width"]):
                 raise ValueError(f"{name} of another size than it says")
             here = things[image["id"]]
             boxes = torch.tensor([thing["bbox"] for thing in here], dtype=torch.float32).reshape(-1, 4)
             boxes[:, 2:] += boxes[:, :2]
             labels = torch.tensor([indices[thing["category_id"]] for thing in here], dtype=torch.int64)
-            examples.append(Example(levels_of(picture), boxes, labels))
+            examples.append(Example(color.levels_of(picture), boxes, labels))
         return examples
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise FileFormatError(f"{path}: expected COCO's JSON beside images/, got {str(error)[:120]}") from None
@@ -160,8 +161,8 @@ class DetectorCourse(Course):
             for control in controls:
                 seed = seeds.stream(side.seed, f"search {control}", number)
                 config = self.work.attack((control,), name, seed=seed, trials=TRIALS, verify_spp=SPP)
-                u = attack_on(config, scene, model).u
-                problem = problem_of(config, scene, model, differentiated=False)
+                u = workbench.attack_on(config, scene, model).u
+                problem = workbench.problem_of(config, scene, model, differentiated=False)
                 plain.append(Example.of(problem, seeds.stream(seed, "plain", 0)))
                 worst.append(Example.of(problem, seeds.stream(seed, "worst", 0), u))
                 self.work.progress.advance(1)
@@ -202,12 +203,12 @@ class DetectorCourse(Course):
         right = [(item.found, item.right(self.student.model)) for item in held_back]
         return Score(*(float(np.mean([known for found, known in right if found == which])) for which in (False, True)))
 
-    def save(self, folder: Path, number: int, new: Sequence[Example]) -> None:
+    def save(self, run: RunDirectory, number: int, new: Sequence[Example]) -> None:
         """Write them as COCO has it, for one's own training."""
-        place, images, things = folder / f"round-{number:03d}", [], list[Any]()
-        for at, (item, file) in enumerate(written(place / "images", new), 1):
+        folder, images, things = f"{PICTURES}/round-{number:03d}", [], list[Any]()
+        for at, (item, name) in enumerate(written(run, f"{folder}/images", new), 1):
             height, width = item.levels.shape[:2]
-            images.append({"id": at, "file_name": file.name, "height": height, "width": width})
+            images.append({"id": at, "file_name": f"{name}.png", "height": height, "width": width})
             for (left, top, right, bottom), label in zip(item.boxes.tolist(), item.labels.tolist(), strict=True):
                 box = [left, top, right - left, bottom - top]
                 things.append({"id": len(things) + 1, "image_id": at, "category_id": label, "bbox": box,
@@ -215,16 +216,16 @@ class DetectorCourse(Course):
         if new:
             named = [{"id": at, "name": name} for at, name in enumerate(self.student.model.labels)]
             coco = {"images": images, "annotations": things, "categories": named}
-            write_bytes(place / "annotations.json", json.dumps(coco).encode())
+            run.write_file(f"{folder}/annotations.json", json.dumps(coco).encode())
 
 
-def written(folder: Path, items: Sequence[Example]) -> Iterator[tuple[Example, Path]]:
-    """Write the picture of each item, and yield it with its file."""
+def written(run: RunDirectory, folder: str, items: Sequence[Example]) -> Iterator[tuple[Example, str]]:
+    """Write the picture of each item into a folder of the run, and yield it with the name of that, without ".png"."""
     for number, item in enumerate(items, 1):
-        folder.mkdir(parents=True, exist_ok=True)
-        file = folder / f"{number:05d}-{'worst' if item.found else 'plain'}.png"
-        write_png(file, item.levels / 255.0)
-        yield item, file
+        (run.path / folder).mkdir(parents=True, exist_ok=True)
+        name = f"{number:05d}-{'worst' if item.found else 'plain'}"
+        run.save_image(name, item.levels / 255.0, folder)
+        yield item, name
 
 
 # ---- How a segmenter is hardened: as a detector is, with a class for each pixel in the place of boxes ---------------
@@ -235,7 +236,7 @@ class SegmenterCourse(DetectorCourse):
     before it was trained: what they are is not known, and they are to stay."""
 
     def usual_loss(self) -> Loss:
-        task: Any = make_task(self.config.task)
+        task = workbench.make_task(self.config.task)
         return partial(pixel_loss, task)
 
     def shown(self, item: Example, mirrored: bool) -> tuple[Tensor, Target]:
@@ -249,14 +250,14 @@ class SegmenterCourse(DetectorCourse):
         x = self.student.model.prepared(levels[None] / 255.0)[:1]
         return x, {"classes": torch.where(there, region.labels[0], classes).to(x.device), "object": there.to(x.device)}
 
-    def save(self, folder: Path, number: int, new: Sequence[Example]) -> None:
-        for item, file in written(folder / f"round-{number:03d}", new):
-            region: Any = item.truth
-            mask = region.mask[..., None].float().expand(-1, -1, 3)
-            write_png(file.with_name(f"{file.stem}-mask.png"), mask)
+    def save(self, run: RunDirectory, number: int, new: Sequence[Example]) -> None:
+        folder = f"{PICTURES}/round-{number:03d}"
+        for item, name in written(run, folder, new):
+            mask = item.truth.mask[..., None].float().expand(-1, -1, 3)
+            run.save_image(f"{name}-mask", mask, folder)
 
 
-def pixel_loss(task: Segmentation, network: nn.Module, x: Tensor, targets: Sequence[Target]) -> Tensor:
+def pixel_loss(task: Task, network: nn.Module, x: Tensor, targets: Sequence[Target]) -> Tensor:
     """Return a network's own loss (transformers' of `labels`), else the cross-entropy, half of it for the object."""
     classes, objects = (torch.stack([target[name] for target in targets]) for name in ("classes", "object"))
     inner: Any = getattr(network, "network", network)

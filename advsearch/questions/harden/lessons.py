@@ -16,23 +16,15 @@ import tarfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch import seeds
-from advsearch.attacks import Domain
-from advsearch.controls import Space
-from advsearch.engine.problem import Problem
-from advsearch.models import Model
-from advsearch.runs.files import write_png
-from advsearch.scene.formation import levels_of, to_8_bit
-from advsearch.scene.transport.lights import why_not
-from advsearch.scene.transport.matrix import LinearRenderer
-from advsearch.trust.writing import replacing
+from advsearch.extend import Domain, Model, Problem, RunDirectory, color, seeds, writing
 
+PICTURES = "artifacts/pictures"  # what was trained on, in the run
 SPP, MATRIX_SPP, DEPTH = 2, 4, 4
 """Samples a pixel of a lesson's pictures, and of a matrix of light transport; segments of the longest path: many
 lessons with some noise teach more than few without."""
@@ -65,9 +57,9 @@ class TextureLesson(Lesson):
     numbers of the conditions that it was made for, and the adversarial texture (d,), which other views may share and
     which changes in place."""
 
-    space: Space
+    space: Any
     domain: Domain
-    linear: LinearRenderer
+    linear: Any
     numbers: Tensor
     texture: Tensor
 
@@ -79,7 +71,7 @@ class TextureLesson(Lesson):
     @property
     def worst(self) -> Tensor:
         with torch.no_grad():
-            return to_8_bit(self.picture(self.texture))
+            return color.to_8_bit(self.picture(self.texture))
 
 
 @dataclass(eq=False)
@@ -93,16 +85,11 @@ class RenderedLesson(Lesson):
     @classmethod
     def of(cls, right: tuple[int, ...], plain: Tensor, pictures: Tensor) -> RenderedLesson:
         """Return a lesson of a picture (H, W, 3) and some (N, H, W, 3) in [0, 1], the first the worst so far."""
-        return cls(right, levels_of(plain), levels_of(pictures), torch.full((len(pictures),), torch.inf))
+        return cls(right, color.levels_of(plain), color.levels_of(pictures), torch.full((len(pictures),), torch.inf))
 
     @property
     def worst(self) -> Tensor:
         return self.pictures[int(self.losses.argmax())] / 255.0
-
-
-def has_matrix(problem: Problem) -> bool:
-    """Whether a matrix of light transport says the pictures of what is searched."""
-    return why_not(problem.renderer, [control.name for control in problem.space.controls[problem.searched :]]) is None
 
 
 def lessons(
@@ -113,7 +100,7 @@ def lessons(
     rendered beside each view as it is (see `tried`); None for two renders of a view: one of the controls moved, and all
     of them. Views that are `shared` have one adversarial texture."""
     domain, start = problem.domain, problem.domain.start
-    linear, quickly, drawn = views and has_matrix(problem), problem.renderer.like(quick=True), list[Lesson]()
+    linear, quickly, drawn = views and problem.is_linear, problem.renderer.like(quick=True), list[Lesson]()
     right = tuple(int(index) for index in problem.truth())
     space, whole_space = (replace(space, scene=None) for space in (problem.searched_space, problem.space))
 
@@ -127,8 +114,8 @@ def lessons(
             whole = problem.whole(start, view)
             numbers = whole[domain.dim :].clone()  # and not all that it is a part of
             if linear:
-                made = LinearRenderer(problem.renderer, whole, view, spp=MATRIX_SPP, quick=True)
-                levels, texture = levels_of(made(whole)), common if shared else begun(view)
+                made = problem.linearised(whole, view, MATRIX_SPP)
+                levels, texture = color.levels_of(made(whole)), common if shared else begun(view)
                 made.let_go(whole_space)
                 drawn.append(TextureLesson(right, levels, space, domain, made, numbers, texture))
                 continue
@@ -142,7 +129,7 @@ def lessons(
             drawn.append(RenderedLesson.of(right, first, torch.stack(pictures)))
         for number in range(plain):
             view = seeds.stream(seed, "plain lesson", number)
-            drawn.append(Lesson(right, levels_of(quickly(problem.whole(start, view), seed=view, spp=SPP))))
+            drawn.append(Lesson(right, color.levels_of(quickly(problem.whole(start, view), seed=view, spp=SPP))))
     return drawn
 
 
@@ -215,18 +202,21 @@ def slopes(
     return torch.autograd.grad(surprise(model(change(pictures)), [lesson.right for lesson in chosen]).sum(), leaves)
 
 
-def save_pictures(folder: Path, number: int, chosen: Sequence[Lesson], labels: Sequence[str]) -> None:
-    """Write the pictures of a round's lessons, ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png``, and those of all
-    rounds as a WebDataset beside the folder: of each picture a ``.png``, a ``.cls`` with the index of its class and a
-    ``.json`` with that and the kind of picture. Members have no time and no owner, so that equal pictures make equal
-    files."""
+def save_pictures(run: RunDirectory, number: int, chosen: Sequence[Lesson], labels: Sequence[str]) -> None:
+    """Write the pictures of a round's lessons into `PICTURES` of the run, and those of all rounds as a WebDataset.
+
+    The pictures are ``CLASS/ROUND-LESSON-plain.png`` and ``...-worst.png``. The WebDataset stands beside their folder.
+    It has of each picture a ``.png``, a ``.cls`` with the index of its class and a ``.json`` with that and the kind of
+    picture. Members have no time and no owner, so that equal pictures make equal files.
+    """
+    folder = run.path / PICTURES
     for place, lesson in enumerate(chosen):
         name = re.sub(r"[^a-z0-9]+", "-", labels[lesson.right[0]].lower()).strip("-")
+        class_folder = f"{PICTURES}/{lesson.right[0]:04d}-{name}"
+        (run.path / class_folder).mkdir(parents=True, exist_ok=True)
         for kind in ("plain", "worst") if with_worst([lesson]) else ("plain",):
-            path = folder / f"{lesson.right[0]:04d}-{name}" / f"{number:03d}-{place:05d}-{kind}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(path, getattr(lesson, kind))
-    with replacing(folder.with_suffix(".tar")) as part, tarfile.open(part, "w") as tar:
+            run.save_image(f"{number:03d}-{place:05d}-{kind}", getattr(lesson, kind), class_folder)
+    with writing.replacing(folder.with_suffix(".tar")) as part, tarfile.open(part, "w") as tar:
         for path in sorted(folder.glob("*/*.png")):
             index, kind = int(path.parent.name[:4]), path.stem.rpartition("-")[2]
             facts = json.dumps({"class": index, "kind": kind})

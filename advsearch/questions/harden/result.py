@@ -7,33 +7,24 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, JsonValue, model_validator
 
-from advsearch.questions.attack.settings import STEPS, AttackConfig
-from advsearch.report import wording
-from advsearch.report.figures import BLUE, RED, draw_shares
-from advsearch.report.shown import (
-    NO_PROOF,
+from advsearch.extend import (
+    AttackConfig,
     Claim,
     Column,
-    Extent,
-    InNotebook,
-    ResultPart,
-    ShownResult,
-    claim,
-    share_text,
-)
-from advsearch.report.wording import interval_text, percent
-from advsearch.runs.results import (
-    ONLY_OF_BOXES,
-    WHAT_BECOMES,
     Fields,
+    InNotebook,
     Interval,
-    Outcomes,
+    ResultPart,
     RunResult,
-    SharedWork,
-    optional,
+    ShownResult,
+    figures,
+    results,
+    setting,
+    setting_as_in,
+    wording,
 )
-from advsearch.settings import setting, setting_as_in
 
+STEPS = 40  # of a search, as of an attack
 ALL = "all"  # the objects of a command that takes all bundled ones
 PLAIN_SCENES, RENDERED_SCENES = 6, 15
 """Scenes that come with each one of the training, of which nothing is drawn but one view: plain ones, where nothing is
@@ -136,7 +127,9 @@ class Share(Fields):
     interval: Interval = Field(description="of that share, 95 %, over scenes of the objects at hand")
     right: int
     count: int
-    outcomes: Outcomes = optional(f"of plain pictures, {WHAT_BECOMES} in the other ones; {ONLY_OF_BOXES}")
+    outcomes: results.Outcomes = results.optional(
+        f"of plain pictures, {results.WHAT_BECOMES} in the other ones; {results.ONLY_OF_BOXES}"
+    )
 
 
 class HardenedControl(Fields):
@@ -201,7 +194,7 @@ class HardenResult(InNotebook, RunResult):
     hardened: str | None = Field(description="what `model` takes to load the hardened one; null if nothing was kept")
     weights: str | None = Field(description="the hardened weights, safetensors")
     pictures: str | None = Field(description="folder of the pictures of the training, a folder for each class")
-    shared: SharedWork | None = Field(
+    shared: results.SharedWork | None = Field(
         default=None, description="how [workers](cluster.md) did that shared the work; absent without"
     )
     warnings: list[str] = Field(description="sentences that a reader has to know")
@@ -226,9 +219,9 @@ HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interva
 ROUNDS: Mapping[str, Column] = {
     "round": "{0[0]}",
     "views trained on": "{0[1].lessons}",
-    "part of the way": lambda row: percent(row[1].part),
-    "plain pictures right": lambda row: percent(row[1].clean),
-    "worst pictures right": lambda row: percent(row[1].robust),
+    "part of the way": lambda row: wording.percent(row[1].part),
+    "plain pictures right": lambda row: wording.percent(row[1].clean),
+    "worst pictures right": lambda row: wording.percent(row[1].robust),
     "kept": lambda row: "yes" if row[1].kept else "",
 }
 SPLIT: Mapping[str, Column] = {
@@ -256,14 +249,17 @@ def shown(result: HardenResult) -> ShownResult:
             name: [None if share is None else (share.accuracy, share.interval) for share in both]
             for name, both in shares.items()
         }
-        draw_shares(axes, bars, ("before", "after"), (RED, BLUE))
+        figures.draw_shares(axes, bars, ("before", "after"), (figures.RED, figures.BLUE))
         axes.set(xlabel="share that is right, with 95 % interval")
         axes.set_title(f"Held-out scenes: {wording.short_name(result.model)}")
         axes.figure.legend(loc="outside lower center", ncols=2)
 
     measured = []
     for name, both in shares.items():
-        cells = [(percent(share.accuracy), interval_text(share.interval)) if share else ("", "") for share in both]
+        cells = [
+            (wording.percent(share.accuracy), wording.interval_text(share.interval)) if share else ("", "")
+            for share in both
+        ]
         measured.append([name, *cells[0], *cells[1]])
     facts = {
         "model": result.model,
@@ -299,6 +295,10 @@ def claims(result: HardenResult) -> Iterator[Claim]:
     """Yield the shares of held-out scenes without a failure."""
     for when, share in (("Before", result.before), ("After hardening", result.after)):
         if share is not None:
-            extent = Extent(what="held-out scenes", count=share.right, total=share.count, interval=share.interval)
-            text = f"{when}, the searches ({result.search}) found no failure in {share_text(extent)} held-out"
-            yield claim("measured", f"{text} scenes. {NO_PROOF}", extent)
+            extent = {"what": "held-out scenes", "count": share.right, "of": share.count, "interval": share.interval}
+            text = (
+                f"{when}, the searches ({result.search}) found no failure in {share.right} of {share.count} "
+                f"({wording.percent(share.accuracy)}, 95 % interval {wording.interval_text(share.interval)}) held-out "
+                "scenes. This does not show that there is none."
+            )
+            yield Claim.of({"kind": "measured", "statement": text, "extent": extent})

@@ -9,7 +9,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
-from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -18,16 +17,13 @@ import torch._dynamo  # by optimisers, too: before there are scenes, whose chang
 from safetensors import torch as safetensors
 from torch import Tensor, nn
 
-from advsearch import seeds, threads
-from advsearch.models.reference import Trainable
+from advsearch.extend import RunDirectory, seeds, wording, workbench
+from advsearch.questions.harden.networks import Trainable
 from advsearch.questions.harden.result import TrainingRound
 from advsearch.questions.harden.scenes import TRAINING, VALIDATION, SceneWork
-from advsearch.report.wording import percent
-from advsearch.runs.directory import ARTIFACTS, RunDirectory
-from advsearch.trust.writing import write_bytes
 
-WEIGHTS, ROUND, PICTURES = "hardened.safetensors", "round-{:03d}.safetensors", "pictures"
-"""In `artifacts/`: the weights that are kept, those after each round, and what they were trained on."""
+WEIGHTS = "artifacts/hardened.safetensors"  # the weights that are kept, in the run
+ROUND = "artifacts/round-{:03d}.safetensors"  # those after each round
 ROUNDS = "rounds"  # the note of what each round came to
 LARGEST_GRADIENT_NORM = 2.0
 JUDGED = 168  # scenes by which weights are chosen, at most
@@ -90,8 +86,8 @@ class Course(ABC):
         """Judge the student on items that it was not trained on, which stay as they are."""
 
     @abstractmethod
-    def save(self, folder: Path, number: int, new: Sequence[Any]) -> None:
-        """Write the pictures of a round's new items."""
+    def save(self, run: RunDirectory, number: int, new: Sequence[Any]) -> None:
+        """Write the pictures of a round's new items into `PICTURES` of the run."""
 
     def steps(self, pool: Sequence[Any]) -> int:
         return self.config.epochs * -(-sum(map(self.looks, pool)) // self.batch)
@@ -142,7 +138,7 @@ class Rounds:
 
     def __init__(self, run: RunDirectory, course: Course) -> None:
         self.run, self.course, self.config = run, course, course.config
-        self.progress, self.folder = course.work.progress, run.path / ARTIFACTS
+        self.progress = course.work.progress
         self.done = [TrainingRound.of(noted) for noted in json.loads(run.store.note(ROUNDS) or "[]")]
 
     @property
@@ -176,7 +172,7 @@ class Rounds:
                 if number < len(self.done):
                     continue  # done before this run was stopped
                 self.progress.stage(f"round {number}: training", course.steps(pool))
-                with threads.all_for_torch():
+                with workbench.all_for_torch():
                     # others are as hard as their training left them
                     course.round(number, pool, pool[begun:], lambda: self.progress.advance(1))
                     self.progress.stage(f"round {number}: choosing weights", len(PARTS), at_most=True)
@@ -215,16 +211,16 @@ class Rounds:
     def keep(self, number: int, new: Sequence[Any], judged: Score, trained: int, part: float) -> None:
         """Keep the weights of a round, with its new pictures and what it came to."""
         self._save(ROUND.format(number))
-        self.course.save(self.folder / PICTURES, number, new)
+        self.course.save(self.run, number, new)
         self.done.append(TrainingRound(lessons=trained, part=part, **judged._asdict(), kept=False))
         self.run.store.set_note(ROUNDS, json.dumps([done.model_dump() for done in self.done]))
-        clean, worst = map(percent, judged)
+        clean, worst = map(wording.percent, judged)
         self.progress.message(f"round {number}: {clean} of plain pictures right, {worst} of the worst")
 
     def _save(self, name: str) -> None:
         state = self.course.student.net.state_dict()  # two names may be of one tensor, which safetensors refuses
         kept = {key: weight.clone(memory_format=torch.contiguous_format) for key, weight in state.items()}
-        write_bytes(self.folder / name, safetensors.save(kept))
+        self.run.write_file(name, safetensors.save(kept))
 
     def _weights(self, number: int) -> dict[str, Tensor]:
-        return safetensors.load((self.folder / ROUND.format(number)).read_bytes())
+        return safetensors.load((self.run.path / ROUND.format(number)).read_bytes())

@@ -14,32 +14,23 @@ import numpy as np
 import torch
 from safetensors import torch as safetensors
 
-from advsearch import seeds
-from advsearch.attacks.verification import WORST_CASE
-from advsearch.bundled.changed_light import varied, white_light_changed
-from advsearch.bundled.objects import OBJECTS
-from advsearch.cluster import Call, InProcess, Workers
-from advsearch.engine.loading import Scene, load_scene
-from advsearch.engine.naming import RUN_SETTINGS, load_models, scene_settings, settings_alone
-from advsearch.engine.problem import Problem
-from advsearch.errors import ClusterError, InputError
-from advsearch.files import JsonObject
-from advsearch.models import Model
-from advsearch.models.reference import copied_network
-from advsearch.models.source import frozen
-from advsearch.options import get_outcome
-from advsearch.progress import NullProgress, Progress
-from advsearch.questions.attack.carry_out import attack_on, problem_of
-from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons
+from advsearch.extend import (
+    AttackConfig,
+    InputError,
+    Model,
+    Problem,
+    Progress,
+    assets,
+    library,
+    results,
+    seeds,
+    settings,
+    workbench,
+)
+from advsearch.questions.harden.changed_light import varied, white_light_changed
+from advsearch.questions.harden.lessons import Lesson, lessons
+from advsearch.questions.harden.objects import OBJECTS
 from advsearch.questions.harden.result import ALL, HardenConfig
-from advsearch.runs.results import INTERRUPTED
-from advsearch.scene.assets import ObjectAsset
-from advsearch.scene.library import list_environments
-from advsearch.scene.settings import Given
-from advsearch.settings import split_names
-from advsearch.settings.values import merged
-from advsearch.tasks import make_task
 
 TRAINING, FURTHER, VALIDATION, HELD_OUT = "training", "further training", "validation", "held out"
 """The splits: what the weights are fitted to (the second mostly as it is), what chooses among them, and what is
@@ -72,8 +63,8 @@ class SceneWork:
     config: HardenConfig
     model: Model
     splits: Mapping[str, SceneSide]
-    progress: Progress = field(default_factory=NullProgress)
-    executor: Workers | None = None
+    progress: Progress = field(default_factory=workbench.NullProgress)
+    executor: Any = None
 
     def __call__(self, wanted: Iterable[Wanted]) -> list[Any]:
         return [each(self) for each in wanted]
@@ -81,13 +72,13 @@ class SceneWork:
     def each(self, title: str, wanted: Sequence[Wanted], hint: str = "") -> Iterator[tuple[int, Any]]:
         """Have done what is wanted of scenes; yield the place of each and what came of it, in any order."""
         self.progress.stage(title, len(wanted), hint=hint)
-        places, executor = {id(each): place for place, each in enumerate(wanted)}, self.executor or InProcess(self)
+        places = {id(each): place for place, each in enumerate(wanted)}
+        executor = self.executor or workbench.InProcess(self)
         for done in executor.results([each] for each in wanted):
             (each,) = done.items
-            if done.lost:
-                raise ClusterError(f"harden, scene {each.keywords['number']}: {done.lost}")
+            (value,) = done.require_value(f"harden, scene {each.keywords['number']}")
             self.progress.advance(1, **({} if executor.facts is None else executor.facts.told))
-            yield places[id(each)], done.value[0]
+            yield places[id(each)], value
 
     def drawn(
         self, *, side: str, number: int, controls: Sequence[str], views: int, plain: int, shared: bool = False,
@@ -103,7 +94,7 @@ class SceneWork:
         """Attack a held-out scene, `times` as long as usual: more than once is the stronger search. Weights of the
         model are safetensors; None for those that it was given with. Return how it ended: `ROBUST` where it found
         nothing and the clean scene is right in as many trials as a verified answer would have to be wrong in."""
-        name, scene = self.splits[HELD_OUT].scene(number, scene_settings(self.config))
+        name, scene = self.splits[HELD_OUT].scene(number, workbench.scene_settings(self.config))
         seed = seeds.stream(self.config.seed, f"measured {control}", number)
         harder = {} if times == 1 else {"policy": STRONGER, "steps": times * self.config.steps}
         config = self.attack((control,), name, seed=seed, **harder)
@@ -122,15 +113,14 @@ class SceneWork:
                 with torch.no_grad():
                     judgement = problem.task.judge(model(picture), truth)[0]
                 right.setdefault(when, []).append(judgement.right)
-                outcome = get_outcome(judgement.payload)
-                if not judgement.right and outcome is not None:
-                    right.setdefault(f"outcomes {when}", []).append(outcome.value)
+                if not judgement.right and judgement.outcome is not None:
+                    right.setdefault(f"outcomes {when}", []).append(judgement.outcome.value)
         return right
 
     def with_weights(self, weights: bytes) -> Model:
-        network = copied_network(self.model)
+        network = self.model.copy_network()
         network.load_state_dict(safetensors.load(weights))
-        return replace(self.model, module=frozen(network, self.model.name))
+        return self.model.with_network(network)
 
     @cached_property
     def linear(self) -> tuple[str, ...]:
@@ -149,7 +139,7 @@ class SceneWork:
     def _has_matrix(self, *controls: str) -> bool:
         """Whether a matrix says the pictures of the first control, the others varying by chance."""
         try:
-            return has_matrix(self.problem(self.splits[TRAINING], 0, controls[:1], controls[1:])[0])
+            return self.problem(self.splits[TRAINING], 0, controls[:1], controls[1:])[0].is_linear
         except InputError:
             if len(controls) > 1:
                 return False
@@ -163,43 +153,44 @@ class SceneWork:
         self, side: SceneSide, number: int, controls: Sequence[str], beside: Sequence[str] = ()
     ) -> tuple[Problem, int]:
         """Return what a scene is searched as, with controls that vary by chance `beside`, and the root of its draws."""
-        name, scene = side.scene(number, scene_settings(self.config))
+        name, scene = side.scene(number, workbench.scene_settings(self.config))
         if side.name != HELD_OUT:
             check_unmeasured(scene.description.object, self._measured)
         kinds = {control.partition(":")[0].partition(".")[0] for control in (*controls, *beside)}
         over = {other: ranges for other, ranges in OVER.items() if other not in kinds}
         over |= {control: self.config.controls[control] for control in beside}
-        problem = problem_of(self.attack(controls, name, over=over), scene, self.model, differentiated=False)
+        problem = workbench.problem_of(self.attack(controls, name, over=over), scene, self.model, differentiated=False)
         return problem, seeds.stream(side.seed, "views", number)
 
     def attack(self, controls: Sequence[str], name: str, **changes: object) -> AttackConfig:
         """Return what some of the controls are searched with, on an object of a name."""
         searched = {control: self.config.controls[control] for control in controls}
-        settings: dict[str, object] = dict.fromkeys(RUN_SETTINGS)
+        changed: dict[str, Any] = {}  # None is what none of the controls takes
         for control, ranges in searched.items():
-            alone = settings_alone(self.config, control, ranges)
-            settings = merged(settings, {setting: value for setting, value in alone.items() if value is not None})
-        settings |= {"object": name, "environment": None, "set_": {}, "exposure": 0.0, **changes, "controls": searched}
-        return AttackConfig.of(self.config, **settings, measure="no", baseline=False, workers=None, cluster=None)
+            alone = workbench.settings_alone(self.config, control, ranges)
+            taken = {setting: value for setting, value in alone.items() if value is not None}
+            changed = settings.merged({**dict.fromkeys(alone), **changed}, taken)
+        changed |= {"object": name, "environment": None, "set_": {}, "exposure": 0.0, **changes, "controls": searched}
+        return AttackConfig.of(self.config, **changed, measure="no", baseline=False, workers=None, cluster=None)
 
 
-def scenes_of(settings: JsonObject) -> Call:
-    """Return what does what is wanted of scenes of the hardening that the settings describe: what a worker does."""
-    config = HardenConfig(**settings)
-    (model, *_), _ = load_models([config.model], make_task(config.task), config)
+def scenes_of(described: Mapping[str, Any]) -> SceneWork:
+    """Return what does what is wanted of scenes of the hardening that settings describe: what a worker does."""
+    config = HardenConfig(**described)
+    (model, *_), _ = workbench.load_models([config.model], workbench.make_task(config.task), config)
     gc.freeze()  # what a scene leaves is collected after each; a sixth of the time goes into looking at all the rest
     return SceneWork(config, model, splits_of(config, model))
 
 
-def attacked(config: AttackConfig, scene: Scene, model: Model) -> str:
+def attacked(config: AttackConfig, scene: workbench.Scene, model: Model) -> str:
     """Attack, and return how it ended; `ROBUST` where nothing was found and the clean scene is steadily right."""
-    summary = attack_on(config, scene, model).summary
-    if summary.ending == INTERRUPTED:
+    summary = workbench.attack_on(config, scene, model).summary
+    if summary.ending == results.INTERRUPTED:
         raise KeyboardInterrupt
     if summary.ending in ("found", "already wrong"):
         return summary.ending
     control = summary.clean.control
-    steady = control is not None and control.correct >= WORST_CASE.needed(control.trials)
+    steady = control is not None and control.correct >= workbench.WORST_CASE.needed(control.trials)
     return ROBUST if steady else "unsteady"
 
 
@@ -226,7 +217,7 @@ class SceneSide:
     seed: int
     varied: bool = False
 
-    def scene(self, number: int, given: Given | None = None) -> tuple[str, Scene]:
+    def scene(self, number: int, given: Mapping[str, Any] | None = None) -> tuple[str, workbench.Scene]:
         """Return the scene with this number, from 0, and the name of its object; the objects take turns. Parameters
         that are given are fixed. An object in a file without a label is called as it: ``coffee-mug.glb``, "coffee mug".
         """
@@ -236,7 +227,7 @@ class SceneSide:
         ground = np.clip(rng.uniform(*GROUND) + rng.normal(0.0, 0.05, 3), 0.02, 0.98)
         drawn = {parameter: rng.uniform(*ends) for parameter, ends in RANGES.items()}
         drawn |= dict(zip(("ground.red", "ground.green", "ground.blue"), ground.tolist(), strict=True))
-        scene = load_scene(made, environment, settings={**drawn, **(given or {})})
+        scene = workbench.load_scene(made, environment, settings={**drawn, **(given or {})})
         described = scene.description
         if self.varied and described.environment is not None:
             light = white_light_changed(varied(described.environment, rng), rng)
@@ -244,12 +235,12 @@ class SceneSide:
         if described.object.label is None:
             label = Path(name).stem.replace("-", " ").replace("_", " ")
             described = replace(described, object=replace(described.object, label=label))
-        return name, scene if described is scene.description else Scene(described)
+        return name, scene if described is scene.description else workbench.Scene(described)
 
     def _draws(self, number: int) -> np.random.Generator:
         return np.random.default_rng([seeds.stream(self.seed, f"{self.name} scene", number)])
 
-    def assets(self, count: int) -> Iterator[ObjectAsset]:
+    def assets(self, count: int) -> Iterator[assets.ObjectAsset]:
         """Yield the objects of the first `count` scenes; what a file holds comes once."""
         for number in range(count):
             name = self.objects[number % len(self.objects)]
@@ -278,15 +269,15 @@ def splits_of(config: HardenConfig, model: Model) -> dict[str, SceneSide]:
             f"held_out: {', '.join(files)} has no other instances; name objects of its class that training never sees"
         )
     lit = [
-        split_names(names) if names else list_environments(bundled)
+        settings.split_names(names) if names else library.list_environments(bundled)
         for names, bundled in ((config.environment, "train"), (config.held_out_environment, "heldout"))
     ]
     sides = {name: (known, lit[0], True) for name in (TRAINING, FURTHER, VALIDATION)}
-    sides[HELD_OUT] = known if config.held_out is None else split_names(config.held_out), lit[1], False
+    sides[HELD_OUT] = known if config.held_out is None else settings.split_names(config.held_out), lit[1], False
     return {name: SceneSide(name, a, b, seeds.stream(config.seed, name), c) for name, (a, b, c) in sides.items()}
 
 
-def fingerprint(asset: ObjectAsset) -> str:
+def fingerprint(asset: assets.ObjectAsset) -> str:
     parts = asset.mesh.vertices, asset.mesh.faces, asset.base_color
     return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()
 
@@ -303,7 +294,7 @@ def check_disjoint(held: SceneSide, taught: Sequence[SceneSide]) -> None:
             check_unmeasured(asset, measured)
 
 
-def check_unmeasured(asset: ObjectAsset, measured: Set[str]) -> None:
+def check_unmeasured(asset: assets.ObjectAsset, measured: Set[str]) -> None:
     """Refuse, by an InputError, to train on an object whose fingerprint is among those of what is measured."""
     if fingerprint(asset) in measured:
         raise InputError(f"held_out: {asset.name} is an object of the training too; name others")

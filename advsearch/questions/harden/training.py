@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch import seeds, threads
-from advsearch.models import Model
-from advsearch.models.reference import Augmentation, Trainable
+from advsearch.extend import Model, RunDirectory, seeds
 from advsearch.questions.harden import lessons
 from advsearch.questions.harden.lessons import Lesson, RenderedLesson, TextureLesson, surprise, with_worst
+from advsearch.questions.harden.networks import Augmentation, Trainable, one_thread_each
 from advsearch.questions.harden.result import PLAIN_SCENES, RENDERED_SCENES
 from advsearch.questions.harden.rounds import Course, MakeOptimiser, Score, Take
 from advsearch.questions.harden.scenes import FURTHER, TRAINING, SceneWork, Wanted
@@ -98,7 +96,7 @@ class ClassifierCourse(Course):
     @contextmanager
     def gradients(self, new: Sequence[Lesson]) -> Iterator[Take]:
         lessons.harder(new, self.student.model, FIRST_STEPS)
-        with threads.one_each_for_torch() as pool:
+        with one_thread_each() as pool:
             gradients = Gradients(self.student, self.work.model, pool)
             yield lambda batch, rng: gradients.take(batch, self._next(), int(rng.integers(2**62)))
 
@@ -129,8 +127,8 @@ class ClassifierCourse(Course):
 
         return Score(right(own, "plain"), right(with_worst(own), "worst"))
 
-    def save(self, folder: Path, number: int, new: Sequence[Lesson]) -> None:
-        lessons.save_pictures(folder, number, new, self.student.model.labels)
+    def save(self, run: RunDirectory, number: int, new: Sequence[Lesson]) -> None:
+        lessons.save_pictures(run, number, new, self.student.model.labels)
 
 
 class Gradients:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from advsearch.experiment import PositionalArgument, RunContext, experiment
+from advsearch.extend import PositionalArgument, RunContext, experiment
 from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, shown
 
 
@@ -16,6 +16,7 @@ from advsearch.questions.recipe.result import RecipeConfig, RecipeResult, shown
     about="recipe",
     positional=PositionalArgument("NAME", "a recipe, or list", "; list shows the recipes that there are"),
     choices="advsearch.questions.recipe.description:titles",
+    choice_description="advsearch.questions.recipe.description:describe",
     view=shown,
 )
 def recipe(asked: RunContext[RecipeConfig]) -> RecipeResult:

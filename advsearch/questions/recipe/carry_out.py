@@ -10,40 +10,32 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from pydantic import ValidationError
 
-from advsearch.config import DEFAULT_ENVIRONMENT, SceneConfig, name_in
-from advsearch.controls import CONTROLS
-from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.experiment import RunContext
-from advsearch.questions.attack.carry_out import check_from_config
-from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.studies import carry_out_part
-from advsearch.questions.attack.summary import AttackSummary, FoundValue, SearchDistribution, attack_of
-from advsearch.questions.photographs.carry_out import Photographs, photographs_in
-from advsearch.questions.photographs.result import LOOSE_PHOTO, PHOTO
+from advsearch.extend import (
+    AttackConfig,
+    FileFormatError,
+    InputError,
+    RunContext,
+    RunDirectory,
+    SceneConfig,
+    Store,
+    SweepConfig,
+    UnknownNameError,
+    figures,
+    read_result,
+    results,
+    wording,
+    workbench,
+)
 from advsearch.questions.recipe import description, given, rates
 from advsearch.questions.recipe.description import PHOTOGRAPHS, PlannedRun, Recipe, first_of, planned
 from advsearch.questions.recipe.rates import TRIAL, TRIALS, WORKERS, MadeFigure, Options, Rows, frame_of, read_rows
 from advsearch.questions.recipe.result import RecipeConfig, RecipeFigure, RecipePart, RecipeResult
-from advsearch.questions.sweep.carry_out import scenes_of
-from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.questions.sweep.summary import SweepSummary
-from advsearch.report.figures import Figures, drawn
-from advsearch.report.wording import DETECTION
-from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
-from advsearch.runs.results import INTERRUPTED
-from advsearch.runs.store import NAME as STORE
-from advsearch.runs.store import Store
-from advsearch.runs.summary import NAME as SUMMARY
-from advsearch.runs.summary import read_result
-from advsearch.threads import cores
-from advsearch.trust.writing import write_bytes
 
 TURN = 360.0
 NOTE = "recipe"  # under which a run's store keeps the recipe, so that it goes on as it began
-DoneRun = tuple[PlannedRun, AttackSummary | SweepSummary]
+DoneRun = tuple[PlannedRun, Any]  # with the result of an attack or of a sweep
 
 FIGURES: Mapping[str, tuple[type[Options], Any]] = {
     "rates": (rates.RatesOptions, rates.rates),
@@ -69,8 +61,8 @@ def carried_out(asked: RunContext[RecipeConfig]) -> RecipeResult:
     config, resumed, noted = asked.config, asked.resumed, None
     if config.photographs is not None and not Path(config.photographs).is_dir():
         raise InputError(f"photographs: expected a folder, got {config.photographs}")
-    if resumed is not None and (resumed / STORE).is_file():  # a run that was stopped at once has noted no recipe
-        with Store(resumed / STORE, read_only=True) as store:
+    if resumed is not None and Store.is_in(resumed):  # a run that was stopped at once has noted no recipe
+        with Store.open_to_read(resumed) as store:
             noted = store.noted(NOTE)
     where = f"{resumed}: the recipe that it began with"
     recipe = description.recipe_of(noted, where) if noted else description.read_recipe(config.recipe)
@@ -82,11 +74,11 @@ def carried_out(asked: RunContext[RecipeConfig]) -> RecipeResult:
     asked.run.store.set_note(NOTE, json.dumps(recipe.model_dump(mode="json")))
     done, warnings = _carried_out(runs, asked)
     if any(result.goes_on for _, result in done):
-        asked.ending = INTERRUPTED
+        asked.ending = results.INTERRUPTED
     elif config.photographs is not None:
         warnings += _take(Path(config.photographs), _photographed(recipe, [run for run, _ in done]), asked.run)
     settings = description.made_of(recipe, config).settings
-    usual = {"object": "", "environment": DEFAULT_ENVIRONMENT, "model": "reference"}
+    usual = {"object": "", "environment": SceneConfig.default_environment, "model": "reference"}
     listed = {name: description.names_listed(settings.get(name) or other) for name, other in usual.items()}
     warnings += [text for _, result in done for text in getattr(result, "warnings", ())]
     result = asked.result(
@@ -98,10 +90,10 @@ def carried_out(asked: RunContext[RecipeConfig]) -> RecipeResult:
                        ending=result.ending, renders=sum(result.renders.values()))
             for run, result in done
         ],
-        figures=[] if asked.ending == INTERRUPTED else list(_figures(recipe, config, done, asked.run)),
+        figures=[] if asked.ending == results.INTERRUPTED else list(_figures(recipe, config, done, asked.run)),
         warnings=list(dict.fromkeys(warnings)),
     )  # fmt: skip
-    if resumed is not None and (resumed / SUMMARY).is_file():  # a run that was killed has not noted any seconds
+    if resumed is not None and (resumed / "summary.json").is_file():  # a run that was killed has not noted any seconds
         result.seconds["total"] += getattr(read_result(resumed), "seconds", {"total": 0.0})["total"]
     return result
 
@@ -114,10 +106,10 @@ def check_described(recipe: Recipe, config: RecipeConfig) -> None:
                 f"photographs: {config.recipe} keeps no pictures to compare them with; recipe realism does"
             )
         for run in wanted:
-            photographs_in(Path(config.photographs) / Path(run.config.object).stem, run.config.task)
+            workbench.photographs_in(Path(config.photographs) / Path(run.config.object).stem, run.config.task)
     for figure in recipe.figures:
         kind, _ = read_options(figure, config.recipe)
-        if kind == "cues" and config.task is not None and name_in(config.task) == DETECTION:
+        if kind == "cues" and config.task_name == wording.DETECTION:
             raise InputError(
                 f"task: {config.recipe} asks whether predictions are classes of the texture or of the shape, and "
                 "detection says whether the object is found; give it a classifier"
@@ -142,18 +134,16 @@ def check_runs(runs: Sequence[PlannedRun]) -> dict[str, set[str]]:
 def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
     """Load what a run names, and return the parameters of its rows; those of `search` where it draws around one."""
     if search is None and isinstance(config, SweepConfig):
-        job = scenes_of(config).job
-        space = job.space(job.places[0], job.sizes[0])
-        halfway = torch.full_like(space.start, 0.5)
-        return {name for u in (space.start, halfway) for name in space.describe(u)}
+        return workbench.row_parameters(config)
     names = set[str]()
     if search is None:
         names.add(TRIAL)  # rows of an attack are its trials
         assert isinstance(config, AttackConfig)
-        check_from_config(config)
+        workbench.check_from_config(config)
     source = search or config
     for name in (*source.controls, *getattr(source, "over", {})):
-        declared = CONTROLS[kind].parameters if (kind := name.partition(":")[0]) in CONTROLS else ()
+        kind = name.partition(":")[0]
+        declared = workbench.CONTROLS[kind].parameters if kind in workbench.CONTROLS else ()
         names |= {f"{name}.{parameter.name}" for parameter in declared} or {f"{name}.{ANY}"}
     return names
 
@@ -188,12 +178,12 @@ def _photographed(recipe: Recipe, runs: Sequence[PlannedRun]) -> list[PlannedRun
 
 def _carried_out(runs: Sequence[PlannedRun], asked: RunContext[RecipeConfig]) -> tuple[list[DoneRun], list[str]]:
     """Carry out what is not done, until a run is interrupted; return the runs, and a sentence for each left out."""
-    done, left_out, folder = list[DoneRun](), list[str](), asked.run.path / PARTS
+    done, left_out = list[DoneRun](), list[str]()
     for number, run in enumerate(runs, start=1):
         config = run.config
         asked.progress.message(f"run {number} of {len(runs)}: {run.part}, {config.object}")
         if run.around is not None:
-            search = attack_of(folder / run.around)
+            search: Any = read_result(RunDirectory.locate_part(asked.run.path, run.around))
             if search.distribution is None:
                 left_out.append(
                     f"{config.object}: the search ended with {search.ending!r} and no distribution, so that the part "
@@ -201,22 +191,21 @@ def _carried_out(runs: Sequence[PlannedRun], asked: RunContext[RecipeConfig]) ->
                 )
                 continue
             config = around(config, search.distribution, search.configuration or {})
-        result = carry_out_part(folder / run.name, config, asked.progress)
-        assert isinstance(result, (AttackSummary, SweepSummary))
+        result = asked.run_part(run.name, config)
         done.append((run, result))
         if result.goes_on:
             break
     return done, left_out
 
 
-def around(config: SceneConfig, distribution: SearchDistribution, searched: Mapping[str, FoundValue]) -> SceneConfig:
+def around(config: SceneConfig, distribution: Any, searched: Mapping[str, Any]) -> SceneConfig:
     """Draw evenly from the distribution that a search found, over the ranges that it searched: mean and
     deviation are the same. An even distribution of deviation s is sqrt(12) s wide. The ranges end where the search's
     did; angles that go all the way round may pass that end, and take the whole turn at most."""
     controls: dict[str, dict[str, object]] = {}
     for (name, mean), deviation in zip(distribution.mean.items(), distribution.deviation, strict=True):
         control, _, parameter = name.partition(".")
-        declared = next(known for known in CONTROLS[control].parameters if known.name == parameter)
+        declared = next(known for known in workbench.CONTROLS[control].parameters if known.name == parameter)
         ends = searched[name].low, searched[name].high, mean.value
         low, high, at = (math.log(value) if declared.log else float(value) for value in ends)  # type: ignore[arg-type]
         wide = math.sqrt(3.0) * deviation * (high - low)
@@ -230,10 +219,11 @@ def around(config: SceneConfig, distribution: SearchDistribution, searched: Mapp
 
 def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> list[str]:
     """Take the photographs in a folder into the runs that are compared with some; return what is missing."""
-    photographs, missing = Photographs(), list[str]()
+    photographs, missing = workbench.Photographs(), list[str]()
     for each in wanted:
         inside = folder / Path(each.config.object).stem
-        photographs.add_files(run.path / PARTS / each.name, files := photographs_in(inside, each.config.task))
+        files = workbench.photographs_in(inside, each.config.task)
+        photographs.add_files(RunDirectory.locate_part(run.path, each.name), files)
         missing += [] if files else [f"{each.config.object}: {inside} has no photographs."]
     if len(missing) == len(wanted):
         names = ", ".join(Path(each.config.object).stem for each in wanted[:8])
@@ -247,20 +237,21 @@ def _figures(
     rows, units, surfaces = list[dict[str, Any]](), dict[str, str](), dict[str, Any]()
     for run, result in done:
         kinds: dict[str, Sequence[str]] = {run.part: tuple(TRIALS)}
-        if isinstance(result, SweepSummary):
-            kinds = {run.part: ("sweep",), PHOTOGRAPHS: (PHOTO, LOOSE_PHOTO)}
+        if isinstance(run.config, SweepConfig):
+            kinds = {run.part: ("sweep",), PHOTOGRAPHS: (workbench.PHOTO, workbench.LOOSE_PHOTO)}
             surfaces |= {run.name: result.surface} if result.surface else {}
         workers = getattr(run.config, WORKERS, None)
         more = {} if workers is None else {WORKERS: workers}
         for part, names in kinds.items():
-            stored, of_them = read_rows(part, kept.path / PARTS / run.name, result, run.config.seed, names, **more)
+            folder = RunDirectory.locate_part(kept.path, run.name)
+            stored, of_them = read_rows(part, folder, result, run.config.seed, names, **more)
             rows, units = rows + stored, units | of_them
-    table = frame_of(rows, recipe.groups, units=units, surfaces=surfaces, cores=cores(), folder=kept.path)
-    figures = [read_options(described, config.recipe) for described in recipe.figures]
-    every = ((kind, made) for kind, options in figures for made in make(table, kind, options))
+    table = frame_of(rows, recipe.groups, units=units, surfaces=surfaces, cores=workbench.cores(), folder=kept.path)
+    wanted = [read_options(described, config.recipe) for described in recipe.figures]
+    every = ((kind, made) for kind, options in wanted for made in make(table, kind, options))
     for number, (kind, made) in enumerate(every, start=1):
         for suffix, data in files_of(made).items():
-            write_bytes(kept.path / IMAGES / f"figure-{number}.{suffix}", data)
+            kept.write_file(f"images/figure-{number}.{suffix}", data)
         yield RecipeFigure.of({"figure": kind, **vars(made)})
 
 
@@ -287,10 +278,10 @@ def make(rows: Rows, kind: str, options: Options) -> Iterator[MadeFigure]:
         yield replace(figure, title=title if len(models) == 1 else f"{title}: {name}")
 
 
-def files_of(made: MadeFigure) -> Figures:
+def files_of(made: MadeFigure) -> dict[str, bytes]:
 
     def draw(figure: Any) -> None:
         figure.suptitle(made.title, x=0.01, ha="left", fontsize=10, fontweight="bold")
         made.draw(figure)
 
-    return drawn(draw, made.size)
+    return figures.drawn(draw, made.size)

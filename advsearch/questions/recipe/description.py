@@ -12,17 +12,22 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from advsearch import seeds
-from advsearch.config import CONFIGS, DEFAULT_ENVIRONMENT, SceneConfig
-from advsearch.errors import FileFormatError, InputError, UnknownNameError
+from advsearch.extend import (
+    AttackConfig,
+    FileFormatError,
+    InputError,
+    SceneConfig,
+    SweepConfig,
+    UnknownNameError,
+    seeds,
+    settings,
+)
 from advsearch.questions.recipe.result import RecipeConfig
-from advsearch.runs.directory import default_name
-from advsearch.settings import read_yaml, split_names
-from advsearch.settings.configuration import PLACE, SettingsError
-from advsearch.settings.values import merged
 
+CONFIGS: Mapping[str, type[SceneConfig]] = {"attack": AttackConfig, "sweep": SweepConfig}
+"""The settings of a part, by its command."""
 PHOTOGRAPHS = "photographs"  # the part that photographs are of
-OF_THE_COMMAND = (*PLACE, "seed", "threads", "deterministic")
+OF_THE_COMMAND = (*settings.PLACE, "seed", "threads", "deterministic")
 """Settings that are said with the command and not in its file."""
 
 MOST_PARTS, MOST_FIGURES, MOST_RUNS = 64, 32, 1000
@@ -101,11 +106,11 @@ class Recipe(_Described):
             if name not in self.parts:
                 raise UnknownNameError("part", name, self.parts, "It stands under `quick` in the recipe.")
         parts = {
-            name: part.model_copy(update={"settings": merged(part.settings, self.quick.parts.get(name, {}))})
+            name: part.model_copy(update={"settings": settings.merged(part.settings, self.quick.parts.get(name, {}))})
             for name, part in self.parts.items()
             if name not in self.quick.without
         }
-        return self.model_copy(update={"settings": merged(self.settings, self.quick.settings), "parts": parts})
+        return self.model_copy(update={"settings": settings.merged(self.settings, self.quick.settings), "parts": parts})
 
 
 def recipe_names() -> tuple[str, ...]:
@@ -122,13 +127,19 @@ def recipe_yaml(name: str) -> str:
     return str((BUNDLED / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
+def describe(name: str) -> tuple[str, dict[str, Any]]:
+    """Return the text of a bundled recipe, and what it says as JSON values."""
+    text = recipe_yaml(name).rstrip("\n")
+    return text, read_recipe(name).model_dump(mode="json")
+
+
 def read_recipe(name: str) -> Recipe:
     """Return a bundled recipe by its name, or that of a YAML file: it has a suffix, or a folder before it."""
     if is_file_name(name):
-        return recipe_of(read_yaml(name), name)
+        return recipe_of(settings.read_yaml(name), name)
     recipe_yaml(name)
     with resources.as_file(BUNDLED / f"{name}.yaml") as path:
-        return recipe_of(read_yaml(path), name)
+        return recipe_of(settings.read_yaml(path), name)
 
 
 def is_file_name(name: str) -> bool:
@@ -167,9 +178,11 @@ def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
     chosen, runs = made_of(recipe, config), list[PlannedRun]()
     for name, part in chosen.parts.items():
         where, kind = f"{config.recipe}: parts: {name}", CONFIGS[part.command]
-        settings = {**chosen.settings, **part.settings}
-        usual = {"environment": DEFAULT_ENVIRONMENT, "model": "reference"} if part.command == "attack" else {}
-        axes = {axis: names_listed(settings.get(axis) or names) for axis, names in {"object": "", **usual}.items()}
+        part_settings = {**chosen.settings, **part.settings}
+        usual = {}
+        if part.command == "attack":
+            usual = {"environment": SceneConfig.default_environment, "model": "reference"}
+        axes = {axis: names_listed(part_settings.get(axis) or names) for axis, names in {"object": "", **usual}.items()}
         for number, values in enumerate(product(*axes.values())):
             own: Settings = dict(zip(axes, values, strict=True))
             words = [word for axis, word in zip(axes, values, strict=True) if axis == "object" or len(axes[axis]) > 1]
@@ -179,19 +192,28 @@ def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
             if (label := config.label_of(str(own["object"]))) is not None:
                 own["label"] = label
             try:
-                made = kind(**{**settings, **own})
-            except SettingsError as error:
-                raise SettingsError(error.problems, where) from None
+                made = kind(**{**part_settings, **own})
+            except settings.SettingsError as error:
+                raise settings.SettingsError(error.problems, where) from None
             except UnknownNameError:
                 raise
             except InputError as error:
                 raise InputError(f"{where}: {error}") from None
-            assert isinstance(made, SceneConfig)
-            folder = f"{number:02d}-{default_name(words[0], [default_name(word, []) for word in words[1:]])}"
+            folder = f"{number:02d}-{folder_name(words)}"
             runs.append(PlannedRun(f"{name}-{folder}", name, made, part.around and f"{part.around}-{folder}"))
     if len(runs) > MOST_RUNS:
         raise InputError(f"{config.recipe}: expected at most {MOST_RUNS} runs, got {len(runs)}; name fewer objects")
     return runs
+
+
+def folder_name(words: Iterable[str]) -> str:
+    """Return a name for a folder of what files or names say, such as ``mug-studio``."""
+    stem, *others = words
+    return _safe_name("-".join([Path(stem).stem, *(_safe_name(Path(word).stem) for word in others)]))
+
+
+def _safe_name(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:80] or "attack"
 
 
 def check_powers(recipe: Recipe, runs: Iterable[PlannedRun], name: str) -> None:
@@ -220,12 +242,12 @@ def made_of(recipe: Recipe, config: RecipeConfig) -> Recipe:
         "resolution",
     )
     asked = {name: value for name in names if (value := getattr(config, name)) is not None}
-    settings: Settings = {**chosen.settings, **asked}
-    if "object" not in settings:
+    all_settings: Settings = {**chosen.settings, **asked}
+    if "object" not in all_settings:
         raise InputError(f"object: expected one, since {config.recipe} names none")
-    return chosen.model_copy(update={"settings": settings})
+    return chosen.model_copy(update={"settings": all_settings})
 
 
 def names_listed(value: object) -> list[str]:
     """Return names that stand in a list, or in a text with commas between them."""
-    return [str(name) for name in value] if isinstance(value, (list, tuple)) else list(split_names(str(value)))
+    return [str(name) for name in value] if isinstance(value, (list, tuple)) else list(settings.split_names(str(value)))

@@ -13,11 +13,9 @@ import numpy.typing as npt
 import pandas as pd
 from pydantic import Field
 
+from advsearch.extend import figures, statistics, wording
 from advsearch.questions.recipe import rates
 from advsearch.questions.recipe.rates import MadeFigure, Options, Rows, Tally
-from advsearch.report.figures import BLUE, GREY, RED
-from advsearch.report.wording import percent
-from advsearch.statistics.intervals import CONFIDENCE
 
 LETTERS, FEWEST_LETTERS = 85, 4  # letters that a bar of the whole width has room for, and of a name that is cut short
 
@@ -49,11 +47,11 @@ def predictions(rows: Rows, options: PredictionsOptions) -> MadeFigure:
         for place, given in enumerate(groups.values()):
             left = 0.0
             for tally, right in given:
-                share, colour = tally.share or 0.0, BLUE if 2 * right >= tally.times else RED
+                share, colour = tally.share or 0.0, figures.BLUE if 2 * right >= tally.times else figures.RED
                 axes.barh(place, share, left=left, color=colour, alpha=0.5, height=0.72, edgecolor="white")
                 axes.text(left + share / 2, place, fitting(tally.name, share), ha="center", va="center", fontsize=7)
                 left += share
-            axes.barh(place, max(1.0 - left, 0.0), left=left, color=GREY, alpha=0.15, height=0.72)
+            axes.barh(place, max(1.0 - left, 0.0), left=left, color=figures.GREY, alpha=0.15, height=0.72)
         axes.set_yticks(range(len(groups)), list(groups))
         axes.invert_yaxis()
         axes.set(xlabel="share of predictions; blue: mostly right, red: mostly wrong, grey: others", xlim=(0.0, 1.0))
@@ -108,8 +106,8 @@ def cues(rows: Rows, options: CuesOptions) -> MadeFigure:
     def draw(figure: Any) -> None:
         axes, ordered = figure.subplots(), sorted(shapes, key=lambda name: shapes[name].share or 0.0)
         shape, texture = ([counts[name].share or 0.0 for name in ordered] for counts in (shapes, named))
-        axes.barh(ordered, shape, color=BLUE, alpha=0.55, height=0.66, label="the object")
-        axes.barh(ordered, texture, left=shape, color=RED, alpha=0.55, height=0.66, label="the texture")
+        axes.barh(ordered, shape, color=figures.BLUE, alpha=0.55, height=0.66, label="the object")
+        axes.barh(ordered, texture, left=shape, color=figures.RED, alpha=0.55, height=0.66, label="the texture")
         for place, name in enumerate(ordered):
             axes.plot(shapes[name].interval(), [place, place], color="#1c1d20", linewidth=1.2)
         axes.set(xlabel="share of predictions; line: 95 % interval of the object's", xlim=(0.0, 1.0))
@@ -158,9 +156,10 @@ def _which(pairs: Sequence[tuple[int, int, int]]) -> str:
     total, shape, texture = map(sum, zip(*pairs, strict=True))
     cue = "shape than by texture" if low > 0.0 else "texture than by shape" if high < 0.0 else ""
     verdict = f"the model goes more by {cue}" if cue else "no difference is shown"
+    by_shape, by_texture = (wording.percent(foretold / total) for foretold in (shape, texture))
     return (
-        f"The most frequent prediction about the same object with other textures is given in {percent(shape / total)}, "
-        f"and that about the same texture on other objects, of as many predictions, in {percent(texture / total)}: "
+        f"The most frequent prediction about the same object with other textures is given in {by_shape}, "
+        f"and that about the same texture on other objects, of as many predictions, in {by_texture}: "
         f"{ahead(pairs):.0f} points more by shape (95 % interval {low:.0f} to {high:.0f}, over pairs of object and "
         f"texture): {verdict}."
     )
@@ -213,7 +212,7 @@ def ternary(rows: Rows, options: TernaryOptions) -> MadeFigure:
         if by_lead:
             break
         by_most = [Tally.over(name, rows[most == k], flags[most == k]) for k, name in enumerate(names)]
-        whose = f"{label}, {percent(times / len(rows))} of all predictions, is"
+        whose = f"{label}, {wording.percent(times / len(rows))} of all predictions, is"
         if len({tally.share for tally in by_most if tally.total}) == 1:
             text.append(f"{whose} given as often whatever most of the mixture is: no difference is shown.")
         else:
@@ -266,7 +265,9 @@ def all_triangles(side: int) -> dict[Triangle, tuple[Shares, Shares, Shares]]:
 def _told_leads(leads: Mapping[str, Doubles]) -> str:
     """The smallest mean lead beside the largest, by normal intervals widened for a choice among all."""
     least, most = (pick(leads, key=lambda name: leads[name].mean()) for pick in (min, max))
-    usual, wide = (NormalDist().inv_cdf(1.0 - (1.0 - CONFIDENCE) / (2.0 * among)) for among in (1, len(leads)))
+    usual, wide = (
+        NormalDist().inv_cdf(1.0 - (1.0 - statistics.intervals.CONFIDENCE) / (2.0 * among)) for among in (1, len(leads))
+    )
 
     def ends(name: str, deviations: float) -> tuple[float, float]:
         mean, half = leads[name].mean(), deviations * _error(leads[name])

@@ -17,20 +17,8 @@ import pandas as pd
 from pandas.api.types import is_numeric_dtype
 from pydantic import BaseModel, ConfigDict, Field
 
-from advsearch.errors import InputError
-from advsearch.options import OUT_OF_VIEW
-from advsearch.questions.attack.summary import AttackSummary
+from advsearch.extend import InputError, Interval, RunDirectory, Store, figures, statistics, wording, workbench
 from advsearch.questions.recipe.description import PHOTOGRAPHS
-from advsearch.questions.sweep.display import surface_sentences
-from advsearch.questions.sweep.summary import SweepSummary
-from advsearch.report.figures import BLUE, MARKS, SERIES, draw_shares
-from advsearch.report.wording import count, figure_value, interval_text, percent, short_name
-from advsearch.runs.directory import IMAGES, PARTS
-from advsearch.runs.results import Interval
-from advsearch.runs.store import NAME, Store
-from advsearch.runs.tables import units_of
-from advsearch.statistics.clustered import mean_share, per_unit, share_interval
-from advsearch.statistics.intervals import CONFIDENCE
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The rows of a recipe's runs as one frame, and what all figures make of it: counts, sentences, a picture.
@@ -52,28 +40,28 @@ Rows = Any  # pd.DataFrame, which has no types
 
 
 def read_rows(
-    part: str, folder: Path, summary: AttackSummary | SweepSummary, seed: int, kinds: Sequence[str], **more: Cell
+    part: str, folder: Path, summary: Any, seed: int, kinds: Sequence[str], **more: Cell
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
     """Return the rows of some kinds that a run has stored, and the units of their parameters. Each has what it shows
     (`object`, `environment`, `model`, and parameters), what was said of it (`answer`, `correct`, `margin`), the `time`
     when it was stored, seconds since 1970, and the `unit` of what it shares with rows that are not independent of it:
     draws of one seed are the same ones, also in another part."""
     rows, units, drawn = list[dict[str, Any]](), dict[str, str](), None
-    with Store(folder / NAME, read_only=True) as store:
-        if isinstance(summary, SweepSummary):
-            drawn = units_of(store, is_drawn=summary.sampler is not None)
+    with Store.open_to_read(folder) as store:
+        if summary.command == "sweep":
+            drawn = workbench.units_of(store, is_drawn=summary.sampler is not None)
         for row in store.rows():
-            if row.kind not in kinds or (row.kind == "sweep" and row.label == OUT_OF_VIEW):
+            if row.kind not in kinds or (row.kind == "sweep" and row.is_out_of_view):
                 continue
             values: dict[str, Any] = {name: about["value"] for name, about in row.values.items()}
             units |= {name: about["unit"] for name, about in row.values.items()}
             unit = f"{folder.name} {row.kind} {row.id}"
             if row.kind == "sweep" and drawn is not None:
                 unit = f"{seed} {drawn.of(row.step)}"
-            if isinstance(summary, AttackSummary):
+            if summary.command == "attack":
                 values[TRIAL], unit = TRIALS[row.kind], f"{seed} {row.step}"
             for name in ("object", "environment", MODEL):
-                values[name] = figure_value(str(values.get(name, getattr(summary, name))))
+                values[name] = wording.figure_value(str(values.get(name, getattr(summary, name))))
             values |= {PREDICTION: row.label or "none", "correct": bool(row.correct), "margin": row.margin}
             rows.append({**values, "time": row.time, PART: part, "unit": unit, **more})
     return rows, units
@@ -113,7 +101,7 @@ def unit_of(rows: Rows, name: str) -> str:
 def by(rows: Rows, name: str) -> dict[str, Rows]:
     """Return the rows by what they have in a column, in the order in which that first comes; numbers by size."""
     size = pd.api.types.is_numeric_dtype(column(rows, name))
-    return {figure_value(value): some for value, some in rows.groupby(name, sort=size)}
+    return {wording.figure_value(value): some for value, some in rows.groupby(name, sort=size)}
 
 
 def most_frequent(predictions: Iterable[str]) -> list[tuple[str, int]]:
@@ -128,14 +116,15 @@ class Tally:
     def __init__(self, name: str, counted: Numbers, of: Numbers) -> None:
         self.name, self.counted, self.of = name, counted, of
         self.times, self.total = round(float(counted.sum())), round(float(of.sum()))
-        self.share = mean_share(counted, of) if self.total else None
+        self.share = statistics.clustered.mean_share(counted, of) if self.total else None
 
     @classmethod
     def over(cls, name: str, rows: Rows, flags: Any = None) -> Tally:
         """Count rows: those with right predictions, or those that flags (n,) say."""
         counted = np.asarray(rows["correct"] if flags is None else flags, dtype=np.float64)
         units = pd.factorize(rows["unit"])[0]
-        return cls(name, per_unit(counted, units), per_unit(np.ones(len(rows)), units))
+        of_units = statistics.clustered.per_unit(np.ones(len(rows)), units)
+        return cls(name, statistics.clustered.per_unit(counted, units), of_units)
 
     def called(self, name: str) -> Tally:
         return Tally(name, self.counted, self.of)
@@ -150,11 +139,14 @@ class Tally:
 
     def interval(self, among: int = 1) -> Interval | None:
         """Return the 95 % interval of the share, widened for a choice among so many (Bonferroni)."""
-        return share_interval(self.counted, self.of, 1.0 - (1.0 - CONFIDENCE) / max(among, 1)) if self.total else None
+        if not self.total:
+            return None
+        confidence = 1.0 - (1.0 - statistics.intervals.CONFIDENCE) / max(among, 1)
+        return statistics.clustered.share_interval(self.counted, self.of, confidence)
 
     def told(self, verb: str = "right") -> str:
         """Return ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``; `verb` is what is counted."""
-        share = f"{percent(self.share)}, 95 % interval {interval_text(self.interval())}"
+        share = f"{wording.percent(self.share)}, 95 % interval {wording.interval_text(self.interval())}"
         return f"{verb} in {self.times} of {self.total} ({share})"
 
     def below(self, other: Tally, among: int = 1) -> bool:
@@ -173,7 +165,7 @@ def extremes(counts: Sequence[Tally], worst: str, best: str, thing: str, verb: s
     shares = [count.share or 0.0 for count in known]
     low, high = known[int(np.argmin(shares))], known[int(np.argmax(shares))]
     if low.share == high.share:
-        return [f"All {len(known)} {thing} have the same share, {percent(low.share)}: no difference is shown."]
+        return [f"All {len(known)} {thing} have the same share, {wording.percent(low.share)}: no difference is shown."]
     named = []
     for tally in (low, high):
         ties = shares.count(tally.share or 0.0) - 1
@@ -249,7 +241,9 @@ class RatesOptions(Options):
 
     @property
     def what(self) -> str:
-        return self.by if self.away_from is None else f"the distance of {self.by} from {figure_value(self.away_from)}"
+        if self.away_from is None:
+            return self.by
+        return f"the distance of {self.by} from {wording.figure_value(self.away_from)}"
 
 
 def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
@@ -321,7 +315,7 @@ def rates(rows: Rows, options: RatesOptions) -> MadeFigure:
             axes.set(xlabel=across, ylabel=f"{label} with 95 % interval")
         else:
             shares = {name: [tally.drawn for tally in each] for name, each in {**apart, **cells}.items()}
-            draw_shares(axes, shares, series)
+            figures.draw_shares(axes, shares, series)
             axes.set(xlabel=f"{label} with 95 % interval")
         if len(series) > 1 and form != "map":
             figure.legend(loc="outside lower center", ncols=min(len(series), 3))
@@ -347,7 +341,7 @@ def _groups(rows: Rows, options: RatesOptions) -> tuple[Mapping[str, Rows], list
         raise InputError(f"figures: rates: expected values of {options.by} that differ, got {low:g} to {high:g}")
     places = ((values - low) / (high - low) * bins).clip(upper=bins - 1).where(values.between(low, high)) // 1
     ends = list(pairwise(low + (high - low) * number / bins for number in range(bins + 1)))
-    named = [f"{figure_value(begin)} to {figure_value(end)}{unit}" for begin, end in ends]
+    named = [f"{wording.figure_value(begin)} to {wording.figure_value(end)}{unit}" for begin, end in ends]
     return {name: rows[places == place] for place, name in enumerate(named)}, [(a + b) / 2 for a, b in ends]
 
 
@@ -367,10 +361,10 @@ def _draw_map(axes: Any, cells: Cells, series: Sequence[str], label: str) -> Non
 def _draw_lines(axes: Any, cells: Cells, series: Sequence[str], middles: Sequence[float]) -> None:
     for number, name in enumerate(series):
         known = [(at, each[number]) for at, each in zip(middles, cells.values(), strict=True) if each[number].total]
-        at, colour = [place for place, _ in known], SERIES[number % len(SERIES)]
+        at, colour = [place for place, _ in known], figures.SERIES[number % len(figures.SERIES)]
         low, high = ([(tally.interval() or (0.0, 1.0))[end] for _, tally in known] for end in (0, 1))
         axes.fill_between(at, low, high, color=colour, alpha=0.15, linewidth=0)
-        mark = MARKS[number % len(MARKS)]
+        mark = figures.MARKS[number % len(figures.MARKS)]
         axes.plot(at, [tally.share for _, tally in known], color=colour, marker=mark, ms=4, label=name)
     axes.set(ylim=(-0.03, 1.03))
     axes.grid(True, axis="y")
@@ -425,7 +419,7 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
                 text.append(
                     f"Renderings and {name}: {tally.told('right about both or wrong about both')}. "
                     f"{_where(True, some)} {_where(False, some)} "
-                    f"The prediction is the same in {same} of {len(some)} ({percent(same / len(some))})."
+                    f"The prediction is the same in {same} of {len(some)} ({wording.percent(same / len(some))})."
                 )
         if part == PHOTOGRAPHS:
             text += ["The intervals take photographs as independent."] if len(pairs) else []
@@ -435,7 +429,7 @@ def agreement(rows: Rows, options: AgreementOptions) -> MadeFigure:
     def draw(figure: Any) -> None:
         axes = figure.subplots()
         shares = {name: [tally.drawn for tally in each] for name, each in bars.items()}
-        draw_shares(axes, shares, series)
+        figures.draw_shares(axes, shares, series)
         axes.set(xlabel="share that agrees, with 95 % interval")
         figure.legend(loc="outside lower center", ncols=1)
 
@@ -465,27 +459,27 @@ def scaling(rows: Rows, options: Options) -> MadeFigure:
     for workers, found in by_count.items():
         gains = (found / slowest.reindex(found.index)).dropna()
         table += [[workers, str(name), float(rate), gains.get(name)] for name, rate in found.items()]
-        told = f"{count(workers, 'worker')}: {_spread(found)} pictures a second"
+        told = f"{wording.count(workers, 'worker')}: {_spread(found)} pictures a second"
         if workers > fewest and len(gains):
             share = 100 * gains.median() * fewest / workers
-            told += f", {_spread(gains)} times as many as {count(fewest, 'worker')} ({share:.0f} % of linear)"
+            told += f", {_spread(gains)} times as many as {wording.count(fewest, 'worker')} ({share:.0f} % of linear)"
         text.append(f"{told}.")
     if (few := min(map(len, by_count.values()))) > 1:
         text.append(
             f"Medians of {few} runs, one of each object, with the lowest and the highest, which enclose the median of "
             f"all such runs with a confidence of {100 * (1 - 0.5 ** (few - 1)):.3g} %."
         )
-    cores = count(rows.attrs["cores"], "core")
+    cores = wording.count(rows.attrs["cores"], "core")
     text.append(f"This machine gives {cores}; what other programs took of it meanwhile is in these numbers.")
 
     def draw(figure: Any) -> None:
         axes, counts = figure.subplots(), list(by_count)
         straight = [slowest.median() / fewest * workers for workers in counts]
-        axes.plot(counts, straight, color="0.7", label=f"linear, from {count(fewest, 'worker')}")
+        axes.plot(counts, straight, color="0.7", label=f"linear, from {wording.count(fewest, 'worker')}")
         for workers, found in by_count.items():
-            axes.plot([workers] * 2, [found.min(), found.max()], color=BLUE, alpha=0.45, linewidth=3)
+            axes.plot([workers] * 2, [found.min(), found.max()], color=figures.BLUE, alpha=0.45, linewidth=3)
         middle = [found.median() for found in by_count.values()]
-        axes.plot(counts, middle, "o-", color=BLUE, ms=5, label="median; bar: lowest to highest run")
+        axes.plot(counts, middle, "o-", color=figures.BLUE, ms=5, label="median; bar: lowest to highest run")
         axes.set_xticks(counts, list(map(str, counts)))
         axes.set(xlabel="workers", ylabel="pictures a second", ylim=(0.0, 1.08 * max(*straight, runs.max())))
         axes.grid(True, axis="y")
@@ -520,15 +514,15 @@ def surface(rows: Rows, options: Options) -> MadeFigure:
         from matplotlib.image import imread  # matplotlib takes half a second
 
         for axes, run in zip(figure.subplots(len(surfaces), squeeze=False)[:, 0], surfaces, strict=True):
-            axes.imshow(imread(rows.attrs["folder"] / PARTS / run / IMAGES / "surface.png"))
+            axes.imshow(imread(RunDirectory.locate_part(rows.attrs["folder"], run) / "images" / "surface.png"))
             axes.axis("off")
 
     table: list[list[Cell]] = [
-        [part.object, short_name(part.model), part.part, part.seen, part.compared, part.worse, part.better]
+        [part.object, wording.short_name(part.model), part.part, part.seen, part.compared, part.worse, part.better]
         for found in surfaces.values()
         for part in found.tables
     ]
     heads = ["object", "model", "parts", "seen", "compared", "with wrong predictions", "with right predictions"]
-    text = [sentence for found in surfaces.values() for sentence in surface_sentences(found)]
+    text = [sentence for found in surfaces.values() for sentence in workbench.surface_sentences(found)]
     title = "Which parts of the surface go with wrong predictions"
     return MadeFigure(title, text, heads, table, draw, (6.4, 2.65 * len(surfaces)))

@@ -9,12 +9,19 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, JsonValue, field_validator
 
-from advsearch.config import SceneConfig, read_joined
-from advsearch.files import MESHES, either
-from advsearch.report.shown import InNotebook, ResultPart, ShownResult
-from advsearch.report.wording import count, percent, short_name
-from advsearch.runs.results import Fields, RunResult
-from advsearch.settings import Clash, Config, setting, setting_as_in, split_names
+from advsearch.extend import (
+    Config,
+    Fields,
+    InNotebook,
+    ResultPart,
+    RunResult,
+    SceneConfig,
+    ShownResult,
+    setting,
+    setting_as_in,
+    settings,
+    wording,
+)
 
 Cell = str | int | float | None
 
@@ -27,7 +34,7 @@ class RecipeConfig(Config):
 
     command: ClassVar[str] = "recipe"
     free: ClassVar[tuple[str, ...]] = (*Config.free, "photographs")
-    clashes: ClassVar[tuple[Clash, ...]] = SceneConfig.clashes
+    clashes: ClassVar[tuple[settings.Clash, ...]] = SceneConfig.clashes
 
     # fmt: off
     recipe: str = setting(
@@ -42,7 +49,6 @@ class RecipeConfig(Config):
     object: str | None = setting_as_in(
         SceneConfig, "object", default=None, otherwise=NAMED,
         description="the object that the model should recognise; several, separated by commas",
-        expects=f"names of objects or {either(MESHES)} files",
     )
     environment: str | None = setting_as_in(
         SceneConfig, "environment", otherwise=NAMED,
@@ -87,7 +93,7 @@ class RecipeConfig(Config):
     _range_in_order = field_validator("value_range")(lambda value: SceneConfig._range_in_order(value))
     _sized = field_validator("resolution", mode="before")(lambda value: SceneConfig._resolution_from_text(value))
     _sides_in_range = field_validator("resolution")(lambda value: SceneConfig._sides_in_range(value))
-    _task = field_validator("task", mode="before")(lambda value: read_joined(value, "task", "classification"))
+    _task = field_validator("task", mode="before")(lambda value: SceneConfig._task_with_options(value))
 
     @field_validator("photographs")
     @classmethod
@@ -109,7 +115,12 @@ class RecipeConfig(Config):
 
     @property
     def title(self) -> tuple[str, ...]:
-        return (Path(self.recipe).stem, *(Path(name).stem for name in split_names(self.object or "")[:1]))
+        return (Path(self.recipe).stem, *(Path(name).stem for name in settings.split_names(self.object or "")[:1]))
+
+    @property
+    def task_name(self) -> str | None:
+        """The name of the task, or None where the recipe says it."""
+        return self.task if self.task is None or isinstance(self.task, str) else str(self.task["name"])
 
     def label_of(self, name: str) -> str | None:
         """Return what was said to be the right label for an object; None for its own."""
@@ -169,10 +180,10 @@ def shown(result: RecipeResult) -> ShownResult:
         sections.append(ResultPart("The numbers", heads=made.columns, rows=rows, folded=True, only="page"))
     rows = [[run.name, run.command, run.ending, str(run.renders)] for run in result.parts]
     heads, names = ("run in parts/", "command", "ending", "renders"), [run.name for run in result.parts]
-    title = count(len(result.parts), "run")
+    title = wording.count(len(result.parts), "run")
     sections.append(ResultPart(title, heads=heads, rows=rows, parts=names, folded=True, only="page"))
     of_what = result.objects, result.environment.split(","), result.model.split(",")
-    objects, environments, models = (", ".join(map(short_name, listed)) for listed in of_what)
+    objects, environments, models = (", ".join(map(wording.short_name, listed)) for listed in of_what)
     facts = {"objects": objects, "environments": environments, "models": models, "runs": str(len(result.parts))}
     facts |= {"renders": str(sum(run.renders for run in result.parts))}
     quick = ["Made with few and small pictures, to see what comes out; no result."] if result.quick else []
@@ -181,7 +192,7 @@ def shown(result: RecipeResult) -> ShownResult:
 
 def _cell(column: str, value: Cell) -> str:
     if column in SHARES:
-        return percent(value) if isinstance(value, (int, float)) else ""
+        return wording.percent(value) if isinstance(value, (int, float)) else ""
     return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
 
 

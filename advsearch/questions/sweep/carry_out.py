@@ -224,6 +224,14 @@ def scenes_of(config: SweepConfig) -> OpenScenes:
     return OpenScenes(job)
 
 
+def row_parameters(config: SweepConfig) -> set[str]:
+    """Load everything that a sweep names, and return the parameters of its rows."""
+    job = scenes_of(config).job
+    space = job.space(job.places[0], job.sizes[0])
+    halfway = torch.full_like(space.start, 0.5)
+    return {name for u in (space.start, halfway) for name in space.describe(u)}
+
+
 def _job(
     config: SweepConfig, places: Sequence[NamedScene], models: Sequence[AnyModel], task: AnyTask, controls: Controls
 ) -> Job:

@@ -19,19 +19,21 @@ from advsearch.engine.journal import Journal, Sent, Shared
 from advsearch.engine.judging import Metrics, check_truth, domain_of, facts_of
 from advsearch.engine.loading import Scene, framed, make_renderer
 from advsearch.engine.problem import Prepared, Problem
-from advsearch.engine.record import Stages, rate_of
+from advsearch.engine.record import rate_of
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import Value
+from advsearch.progress import Stages
 from advsearch.questions.sweep.axes import Axis, Drawn, Points, on_grid
 from advsearch.questions.sweep.predicting import PredictedSweep, SweptPicture
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.summary import WorstVerified
 from advsearch.questions.sweep.tracks import ConstantVelocity, Tracker
 from advsearch.runs.directory import RunDirectory
+from advsearch.scene.color import to_8_bit
 from advsearch.scene.description import ENVIRONMENT, OBJECT
-from advsearch.scene.formation import next_count, to_8_bit
+from advsearch.scene.formation import next_count
 from advsearch.scene.renderer import Renderer
 from advsearch.tasks import Facts, Judgement, Task
 from advsearch.viewer import thumbnails

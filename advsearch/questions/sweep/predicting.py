@@ -21,7 +21,7 @@ from advsearch.engine.problem import Problem
 from advsearch.questions.sweep.axes import Axis, Points
 from advsearch.runs.results import LinearTransport, PredictionError
 from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.color import to_8_bit
 from advsearch.scene.mitsuba_backend.surface import RAYS
 from advsearch.scene.predictor import MOST_BYTES, NOISE, NOTHING_MOVES, Predictor, Refusal
 from advsearch.scene.renderer import Renderer

@@ -6,10 +6,10 @@ from itertools import product
 
 import numpy as np
 
-import advsearch.bundled.objects.shapes as shapes
-from advsearch.bundled.objects.family import Instance, family, finish
-from advsearch.bundled.objects.shapes import Array, Patch
-from advsearch.bundled.objects.textures import (
+import advsearch.questions.harden.objects.shapes as shapes
+from advsearch.questions.harden.objects.family import Instance, family, finish
+from advsearch.questions.harden.objects.shapes import Array, Patch
+from advsearch.questions.harden.objects.textures import (
     Draw,
     Paint,
     between,

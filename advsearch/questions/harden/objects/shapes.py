@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicHermiteSpline, RegularGridInterpolator
 
-from advsearch.scene.assets import Bools, Ints, face_vectors
+from advsearch.extend import assets
 
 # ---- Plane and space curves from which the bundled objects are made. Float64; lengths in the object's units ---------
 
@@ -133,7 +133,7 @@ class Patch:
     vertices: Array  # (V, 3) positions
     normals: Array  # (V, 3) unit normals, outwards
     uvs: Array  # (V, 2) chart coordinates in [0, 1]
-    faces: Ints  # (F, 3) vertex indices
+    faces: assets.Ints  # (F, 3) vertex indices
     size: tuple[float, float]  # width and height of the chart, in object units; its share of the atlas follows from it
     rest: Rest  # maps (N,) u and (N,) v to the (N, 3) surface points as they were before `placed`
 
@@ -160,7 +160,7 @@ def grid(tag: str, points: Array, normals: Array, size: tuple[float, float], dow
 
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
     faces = (corner[:, None] + [[0, 1, columns + 1, 0, columns + 1, columns]]).reshape(-1, 3).astype(np.int64)
-    area = np.linalg.norm(face_vectors(points.reshape(-1, 3)[faces]), axis=1)
+    area = np.linalg.norm(assets.face_vectors(points.reshape(-1, 3)[faces]), axis=1)
     faces = faces[area > 1e-6 * float(np.median(area[area > 0.0]))]  # none where a row shrinks to a point
     places = RegularGridInterpolator((down, across), points, bounds_error=False, fill_value=None)
 
@@ -177,7 +177,7 @@ def _along(curve: Array) -> tuple[Array, float]:
     return at / at[-1], float(at[-1])
 
 
-def _fan(count: int) -> Ints:
+def _fan(count: int) -> assets.Ints:
     """The faces (count, 3) between a middle, which is vertex 0, and a ring of `count` vertices after it."""
     j = np.arange(count)
     return np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % count], axis=1).astype(np.int64)
@@ -463,12 +463,12 @@ def cropped(patch: Patch) -> Patch:
     return replace(patch, uvs=uvs, size=size, rest=lambda u, v: patch.rest(low[0] + u * span[0], low[1] + v * span[1]))
 
 
-def _edges(patch: Patch) -> Ints:
+def _edges(patch: Patch) -> assets.Ints:
     pairs = np.concatenate([patch.faces[:, [0, 1]], patch.faces[:, [1, 2]], patch.faces[:, [2, 0]]])
     return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64))
 
 
-def _split(patch: Patch, value: Array) -> tuple[Patch, Bools]:
+def _split(patch: Patch, value: Array) -> tuple[Patch, assets.Bools]:
     """The patch with its triangles split where the values change sign, and (F,) whether each face is inside."""
     edges = _edges(patch)
     crossed = edges[value[edges[:, 0]] * value[edges[:, 1]] < 0.0]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-import advsearch.bundled.objects.shapes as shapes
-from advsearch.bundled.objects.family import Instance, family, finish
-from advsearch.bundled.objects.shapes import Array, Patch, Points
-from advsearch.bundled.objects.textures import (
+import advsearch.questions.harden.objects.shapes as shapes
+from advsearch.questions.harden.objects.family import Instance, family, finish
+from advsearch.questions.harden.objects.shapes import Array, Patch, Points
+from advsearch.questions.harden.objects.textures import (
     Draw,
     Texels,
     between,

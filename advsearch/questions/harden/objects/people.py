@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from advsearch.bundled.objects.family import Instance, family
-from advsearch.bundled.objects.shapes import Array, Patch, Rest
-from advsearch.bundled.objects.textures import Draw, Texels, hexed, mix, noise, painter, step
-from advsearch.scene.assets import Material, face_vectors
-from advsearch.scene.people import Person, body_data
+from advsearch.extend import assets, library
+from advsearch.questions.harden.objects.family import Instance, family
+from advsearch.questions.harden.objects.shapes import Array, Patch, Rest
+from advsearch.questions.harden.objects.textures import Draw, Texels, hexed, mix, noise, painter, step
 
 FINISHES = {
-    "shirt": Material(roughness=0.85, specular=0.2), "trousers": Material(roughness=0.9, specular=0.2),
-    "skin": Material(roughness=0.5, specular=0.35), "hair": Material(roughness=0.55, specular=0.3),
-    "shoes": Material(roughness=0.4), "eyes": Material(roughness=0.1),
+    "shirt": assets.Material(roughness=0.85, specular=0.2), "trousers": assets.Material(roughness=0.9, specular=0.2),
+    "skin": assets.Material(roughness=0.5, specular=0.35), "hair": assets.Material(roughness=0.55, specular=0.3),
+    "shoes": assets.Material(roughness=0.4), "eyes": assets.Material(roughness=0.1),
 }  # fmt: skip
 
 
@@ -29,7 +30,7 @@ def _rest(charts: Array, points: Array) -> Rest:
     return places
 
 
-def _patches(person: Person) -> list[Patch]:
+def _patches(person: Any) -> list[Patch]:
     data = person.data
     vertices = person.standing.numpy().astype(np.float64)
     index = data["index"].astype(np.int64)
@@ -41,7 +42,7 @@ def _patches(person: Person) -> list[Patch]:
     faces = data["faces"].astype(np.int64)
     whole = np.concatenate([faces[a:b] + start for a, b, start in zip(ends, ends[1:], starts, strict=False)])
     summed = np.zeros((int(index.max()) + 1, 3))  # smooth across the seams of charts
-    np.add.at(summed, index[whole].reshape(-1), np.repeat(face_vectors(vertices[whole]), 3, axis=0))
+    np.add.at(summed, index[whole].reshape(-1), np.repeat(assets.face_vectors(vertices[whole]), 3, axis=0))
     normals = summed[index]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     patches = []
@@ -111,7 +112,7 @@ def person(draw: Draw) -> Instance:
         "weight": draw(0.5, 0.25, 0.8), "age": draw(35.0, 16.0, 75.0), "stride": draw(0.0, 0.0, 1.2),
         "walk": draw(0.0, 0.0, 360.0),
     }  # fmt: skip
-    body = Person(body_data(), about)
+    body = library.make_person(about)
     skin = hexed(draw.pick("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4"))
     hair = hexed(draw.pick("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c"))
     paints = {

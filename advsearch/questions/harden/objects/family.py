@@ -8,10 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.bundled.objects.shapes import Array, Patch
-from advsearch.bundled.objects.textures import Draw, Paint, Texels
-from advsearch.scene.assets import Material, Mesh, MeshRig, ObjectAsset, footing
-from advsearch.scene.library import BUNDLED_OBJECT, finished
+from advsearch.extend import assets, library
+from advsearch.questions.harden.objects.shapes import Array, Patch
+from advsearch.questions.harden.objects.textures import Draw, Paint, Texels
 
 # ---------------------------------------------------------------------------------------------------------------------
 # From patches and paints to one mesh with one texture: packs the charts, paints them, joins the pieces.
@@ -98,11 +97,11 @@ def painted(
     return np.asarray(levels.astype(np.float32) / np.float32(255.0))
 
 
-def joined(patches: Sequence[Patch], places: Sequence[AtlasPlace], side: int = SIZE) -> Mesh:
+def joined(patches: Sequence[Patch], places: Sequence[AtlasPlace], side: int = SIZE) -> assets.Mesh:
     """Return one mesh, largest extent 1, standing on z = 0 and centred, every number rounded to `DECIMALS`."""
     starts = np.cumsum([0] + [len(p.vertices) for p in patches[:-1]])
     vertices = np.concatenate([p.vertices for p in patches])
-    origin, extent = footing(vertices)
+    origin, extent = assets.footing(vertices)
     vertices = (vertices - origin) / extent
     normals = np.concatenate([p.normals for p in patches])
     uvs = []
@@ -114,7 +113,7 @@ def joined(patches: Sequence[Patch], places: Sequence[AtlasPlace], side: int = S
     used = np.unique(faces)  # poles leave vertices behind that no triangle needs
     renumbered = np.searchsorted(used, faces).astype(np.uint32)
     corners = np.clip(np.concatenate(uvs)[used], 0.0, 1.0)
-    return Mesh(_exact(vertices[used]), renumbered, _exact(normals[used]), _exact(corners))
+    return assets.Mesh(_exact(vertices[used]), renumbered, _exact(normals[used]), _exact(corners))
 
 
 def _exact(values: Array) -> npt.NDArray[np.float32]:
@@ -128,12 +127,12 @@ class Instance:
 
     patches: Sequence[Patch]  # the surface
     paints: Mapping[str, Paint]  # a paint for every tag of the patches
-    material: Material  # the other surface parameters
+    material: assets.Material  # the other surface parameters
     # texels along an edge relative to the rest of the object, by tag, for parts that are hardly seen
     detail: Mapping[str, float] = field(default_factory=dict)
     # of an object of several materials, what each tag is like; its tags are then names of materials
-    finishes: Mapping[str, Material] = field(default_factory=dict)
-    rig: MeshRig | None = None  # what moves the vertices of all patches, in the order of the patches
+    finishes: Mapping[str, assets.Material] = field(default_factory=dict)
+    rig: assets.MeshRig | None = None  # what moves the vertices of all patches, in the order of the patches
     drives: bool = False  # as `ObjectAsset.drives`
 
 
@@ -151,7 +150,7 @@ class ObjectFamily:
         """The class in words: the name with spaces for hyphens."""
         return self.name.replace("-", " ")
 
-    def generate(self, rng: np.random.Generator | None) -> ObjectAsset:
+    def generate(self, rng: np.random.Generator | None) -> assets.ObjectAsset:
         """Return the canonical instance (None), or one with drawn proportions, texture and material.
 
         The mesh has largest extent 1 and rests on z = 0. The same state of the generator gives the same asset.
@@ -169,10 +168,10 @@ class ObjectFamily:
             materials = {str(tag): np.nonzero(tags_of == tag)[0] for tag in dict.fromkeys(tags_of)}
             mesh = replace(mesh, materials=materials, rig=instance.rig)
         extent = np.ptp(np.concatenate([patch.vertices for patch in patches]), axis=0).max()
-        return ObjectAsset(
+        return assets.ObjectAsset(
             name=self.name, mesh=mesh, base_color=painted(patches, charts, instance.paints, self.texels),
-            material=instance.material, label=self.label, source=BUNDLED_OBJECT,
-            surface=finished(mesh, instance.finishes, instance.material) if instance.finishes else None,
+            material=instance.material, label=self.label, source=library.BUNDLED_OBJECT,
+            surface=library.finished(mesh, instance.finishes, instance.material) if instance.finishes else None,
             finishes=instance.finishes, metres=round(float(extent) * self.metres, 4), drives=instance.drives,
         )  # fmt: skip
 
@@ -182,10 +181,10 @@ def family(metres: float, texels: int = SIZE) -> Callable[[Callable[[Draw], Inst
     return lambda make: ObjectFamily(make.__name__.replace("_", "-"), make, metres, texels)
 
 
-def finish(draw: Draw, roughness: float, clearcoat: float = 0.0, spread: float = 0.2) -> Material:
+def finish(draw: Draw, roughness: float, clearcoat: float = 0.0, spread: float = 0.2) -> assets.Material:
     """Return a material near the given one: roughness within `spread`, and now and then another coat."""
     rough = min(max(draw(roughness, roughness - spread, roughness + spread), 0.12), 0.95)
     coat = draw(clearcoat, 0.0, 1.0) if draw.chance(0.3) else clearcoat
     metal = draw(0.0, 0.3, 0.8) if draw.chance(0.06) else 0.0
     numbers = {"roughness": rough, "metallic": metal, "specular": draw(0.5, 0.3, 0.7), "clearcoat": coat}
-    return Material(**{name: round(value, 4) for name, value in numbers.items()})
+    return assets.Material(**{name: round(value, 4) for name, value in numbers.items()})

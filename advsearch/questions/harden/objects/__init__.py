@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from advsearch.bundled.objects.cars import car
-from advsearch.bundled.objects.family import Instance, ObjectFamily
-from advsearch.bundled.objects.furniture import chair, lamp
-from advsearch.bundled.objects.kitchen import frying_pan, teapot
-from advsearch.bundled.objects.people import person
-from advsearch.bundled.objects.things import ball, banana, book, stop_sign
-from advsearch.bundled.objects.tools import dumbbell, hammer
-from advsearch.bundled.objects.vessels import bottle, bowl, mug, vase, wine_glass
+from advsearch.questions.harden.objects.cars import car
+from advsearch.questions.harden.objects.family import Instance, ObjectFamily
+from advsearch.questions.harden.objects.furniture import chair, lamp
+from advsearch.questions.harden.objects.kitchen import frying_pan, teapot
+from advsearch.questions.harden.objects.people import person
+from advsearch.questions.harden.objects.things import ball, banana, book, stop_sign
+from advsearch.questions.harden.objects.tools import dumbbell, hammer
+from advsearch.questions.harden.objects.vessels import bottle, bowl, mug, vase, wine_glass
 
 _HOUSEHOLD = (
     mug, bowl, bottle, vase, teapot, wine_glass, frying_pan, hammer, banana, ball, chair, lamp, book, dumbbell,

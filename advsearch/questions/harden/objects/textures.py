@@ -16,7 +16,7 @@ from typing import Concatenate, ParamSpec, TypeVar
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from advsearch.bundled.objects.shapes import Array
+from advsearch.questions.harden.objects.shapes import Array
 
 # ---- One way to write a family: each proportion and each colour is stated once, with what else it may be ------------
 

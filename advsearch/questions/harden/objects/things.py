@@ -8,10 +8,11 @@ from itertools import combinations
 
 import numpy as np
 
-import advsearch.bundled.objects.shapes as shapes
-from advsearch.bundled.objects.family import Instance, family, finish
-from advsearch.bundled.objects.shapes import Array, Patch
-from advsearch.bundled.objects.textures import (
+import advsearch.questions.harden.objects.shapes as shapes
+from advsearch.extend import assets
+from advsearch.questions.harden.objects.family import Instance, family, finish
+from advsearch.questions.harden.objects.shapes import Array, Patch
+from advsearch.questions.harden.objects.textures import (
     Draw,
     Paint,
     Texels,
@@ -27,7 +28,6 @@ from advsearch.bundled.objects.textures import (
     solid,
     step,
 )
-from advsearch.scene.assets import Material
 
 _GOLDEN = (1.0 + 5.0**0.5) / 2.0
 _SIGNS = ((a, b) for a in (-1.0, 1.0) for b in (-_GOLDEN, _GOLDEN))
@@ -272,8 +272,8 @@ _STROKES = {  # letters in a cell 1 high and 0.6 wide: runs of points (x, y)
     "P": [[(0.04, 0.0), (0.04, 0.97), (0.46, 0.97), (0.58, 0.85), (0.58, 0.58), (0.46, 0.46), (0.04, 0.46)]],
 }  # fmt: skip
 FINISHES = {
-    "face": Material(roughness=0.35, clearcoat=0.4), "metal": Material(roughness=0.5, metallic=0.6),
-    "post": Material(roughness=0.45, metallic=0.7), "rubber": Material(roughness=0.85),
+    "face": assets.Material(roughness=0.35, clearcoat=0.4), "metal": assets.Material(roughness=0.5, metallic=0.6),
+    "post": assets.Material(roughness=0.45, metallic=0.7), "rubber": assets.Material(roughness=0.85),
 }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from advsearch.scene.assets import EnvironmentAsset
+from advsearch.extend import assets
 
 WARM = (1.06, 0.18, -1.25)
 """Logarithms of what light of 2,700 K has of red, green and blue, beside light of 6,500 K; their mean is about zero."""
@@ -15,7 +15,7 @@ OF_WARM = (-0.24, 1.0)  # ends of the uniform factor of `WARM`: about 10,000 and
 WHITE_LIGHT_CHANGES = 0.5  # how often the colour of light is changed
 
 
-def varied(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:
+def varied(environment: assets.EnvironmentAsset, rng: np.random.Generator) -> assets.EnvironmentAsset:
     """Mirror, tint, change the contrast of, and add one soft light to an environment, each by chance."""
     radiance = environment.radiance[:, ::-1] if rng.random() < 0.5 else environment.radiance
     radiance = radiance * np.exp(rng.normal(0.0, 0.1, 3)).astype(np.float32)
@@ -34,7 +34,7 @@ def varied(environment: EnvironmentAsset, rng: np.random.Generator) -> Environme
     return replace(environment, radiance=np.ascontiguousarray(radiance, dtype=np.float32))
 
 
-def white_light_changed(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:
+def white_light_changed(environment: assets.EnvironmentAsset, rng: np.random.Generator) -> assets.EnvironmentAsset:
     """Change the colour temperature of all light of an environment, by chance, in one of two cases.
 
     Relative to daylight (D65), what a black body of 2,700 K (an incandescent lamp) gives in linear sRGB is about

@@ -12,11 +12,11 @@ from itertools import pairwise, product
 import numpy as np
 from scipy.special import logsumexp
 
-import advsearch.bundled.objects.shapes as shapes
-from advsearch.bundled.objects.family import Instance, family
-from advsearch.bundled.objects.shapes import Array, Patch
-from advsearch.bundled.objects.textures import Draw, Paint, Texels, hexed, mix, painter, solid, step
-from advsearch.scene.assets import Material
+import advsearch.questions.harden.objects.shapes as shapes
+from advsearch.extend import assets
+from advsearch.questions.harden.objects.family import Instance, family
+from advsearch.questions.harden.objects.shapes import Array, Patch
+from advsearch.questions.harden.objects.textures import Draw, Paint, Texels, hexed, mix, painter, solid, step
 
 AXLES = (1.29, -1.33)
 WHEEL, TYRE = 0.33, 0.215  # radius and width
@@ -291,12 +291,18 @@ def _plate(t: Texels, ground: Array) -> Array:
     return mix(ground, hexed("16181c"), (field & strokes).astype(np.float64))
 
 
-GLASS = Material(roughness=0.04, specular=0.6)
+GLASS = assets.Material(roughness=0.04, specular=0.6)
 FINISHES = {
-    "paint": Material(roughness=0.38, clearcoat=1.0), "glass": GLASS, "headlight": GLASS, "taillight": GLASS,
-    "rubber": Material(roughness=0.85), "rim": Material(roughness=0.3, metallic=0.9), "trim": Material(roughness=0.5),
-    "plate": Material(roughness=0.4), "well": Material(roughness=0.95),
-}  # fmt: skip
+    "paint": assets.Material(roughness=0.38, clearcoat=1.0),
+    "glass": GLASS,
+    "headlight": GLASS,
+    "taillight": GLASS,
+    "rubber": assets.Material(roughness=0.85),
+    "rim": assets.Material(roughness=0.3, metallic=0.9),
+    "trim": assets.Material(roughness=0.5),
+    "plate": assets.Material(roughness=0.4),
+    "well": assets.Material(roughness=0.95),
+}
 
 
 @family(metres=1.0, texels=384)
