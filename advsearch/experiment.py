@@ -22,10 +22,12 @@ from typing import Any, Generic, NamedTuple, TypeVar, get_args, get_type_hints
 from advsearch import registry
 from advsearch.errors import FELL_SHORT
 from advsearch.interrupts import interruptible
-from advsearch.progress import NullProgress, Progress, watcher
+from advsearch.progress import NullProgress, Progress, Stages, watcher
 from advsearch.report.shown import Claim, ShownResult, result_figure, shown
-from advsearch.runs.directory import RunDirectory, begun
+from advsearch.runs.directory import CONFIG, RunDirectory, begun, is_run
+from advsearch.runs.listing import finished
 from advsearch.runs.results import INTERRUPTED, Result
+from advsearch.runs.summary import read_result
 from advsearch.settings import Config
 from advsearch.trust.writing import write_bytes
 from advsearch.viewer.pages import keep_result
@@ -78,6 +80,11 @@ class RunContext(ExitStack, Generic[Settings]):
         """The run directory. The first access creates it, so check everything that may be wrong before."""
         return self.enter_context(RunDirectory.of(self.config, self.resumed))
 
+    @cached_property
+    def stages(self) -> Stages:
+        """The stages of the experiment; their seconds count from the first access."""
+        return Stages(self.progress)
+
     @property
     def has_run(self) -> bool:
         """Whether the run directory has been created through this context."""
@@ -91,6 +98,10 @@ class RunContext(ExitStack, Generic[Settings]):
                 yield
         except KeyboardInterrupt:
             self.ending = INTERRUPTED
+
+    def run_part(self, name: str, config: Config) -> Result:
+        """Run an experiment in a folder of its own within this run, or read its result if it has ended."""
+        return run_part(RunDirectory.locate_part(self.run.path, name), config, self.progress)
 
     def result(self, result_type: type[Made], **fields: Any) -> Made:
         """Return a result with the given fields and those that every result has.
@@ -150,6 +161,23 @@ def run_experiment(config: Config, *, progress: Progress | None = None, resumed:
     with begun(config) if writes_run else nullcontext(resumed) as folder:
         experiment: Experiment[Result] = registry.get_experiment(config.command)
         return experiment.run(config, progress=progress, resumed=folder)
+
+
+def run_part(folder: Path, config: Config, progress: Progress, run: Callable[..., Result] | None = None) -> Result:
+    """Run an experiment in a folder, continue it there, or read its result if it has ended.
+
+    Args:
+        folder: of the run; a run that has begun there keeps its own settings.
+        config: settings of a run that has not begun.
+        progress: is told how far it is.
+        run: runs the experiment with settings; None for `run_experiment`.
+    """
+    run = run or run_experiment
+    if not is_run(folder) or not (folder / CONFIG).is_file():
+        return run(config.model_copy(update={"run": str(folder), "overwrite": True}), progress=progress)
+    if finished(folder):
+        return read_result(folder)
+    return run(type(config).from_yaml(folder / CONFIG, config.asked), progress=progress, resumed=folder)
 
 
 class PositionalArgument(NamedTuple):

@@ -13,8 +13,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from advsearch import rules as rules
     from advsearch import seeds as seeds
+    from advsearch import settings as settings
     from advsearch import statistics as statistics
+    from advsearch.api import workbench as workbench
     from advsearch.attacks import Domain as Domain
     from advsearch.attacks import Evaluation as Evaluation
     from advsearch.attacks import Policy as Policy
@@ -45,8 +48,10 @@ if TYPE_CHECKING:
     from advsearch.report.shown import Claim as Claim
     from advsearch.report.shown import Column as Column
     from advsearch.report.shown import InNotebook as InNotebook
+    from advsearch.report.shown import Picture as Picture
     from advsearch.report.shown import ResultPart as ResultPart
     from advsearch.report.shown import ShownResult as ShownResult
+    from advsearch.runs import results as results
     from advsearch.runs.directory import RunDirectory as RunDirectory
     from advsearch.runs.directory import find_run as find_run
     from advsearch.runs.exporters import Exported as Exported
@@ -80,7 +85,7 @@ _NAMES = {
     "advsearch.progress": ("Progress",),
     "advsearch.questions.attack.settings": ("AttackConfig",),
     "advsearch.questions.sweep.settings": ("SweepConfig",),
-    "advsearch.report.shown": ("Claim", "Column", "InNotebook", "ResultPart", "ShownResult"),
+    "advsearch.report.shown": ("Claim", "Column", "InNotebook", "Picture", "ResultPart", "ShownResult"),
     "advsearch.runs.directory": ("RunDirectory", "find_run"),
     "advsearch.runs.exporters": ("Exported", "Exporter"),
     "advsearch.runs.results": ("Fields", "Interval", "RunResult"),
@@ -96,9 +101,13 @@ _MODULES = {
     "color": "advsearch.scene.color",
     "figures": "advsearch.report.figures",
     "geometry": "advsearch.scene.geometry",
+    "results": "advsearch.runs.results",
+    "rules": "advsearch.rules",
     "seeds": "advsearch.seeds",
+    "settings": "advsearch.settings",
     "statistics": "advsearch.statistics",
     "wording": "advsearch.report.wording",
+    "workbench": "advsearch.api.workbench",
 }
 """Modules of functions that belong to the interface as a whole."""
 

@@ -41,6 +41,31 @@ class NullProgress(Progress):
     """The watcher that looks away: what a Python call uses when it is given none."""
 
 
+class Stages:
+    """Reports the stages of a run to its watcher, and measures the seconds of each by name."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.progress = progress
+        self.seconds: dict[str, float] = {}
+        self._name = ""
+        self._started = self._begun = time.perf_counter()
+
+    def begin(self, name: str, title: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        """End the stage before and begin another; a `name` that comes twice adds up. The rest: `Progress.stage`."""
+        self.end()
+        self._name, self._begun = name, time.perf_counter()
+        self.progress.stage(title, total, hint=hint, at_most=at_most)
+
+    def end(self) -> None:
+        if self._name:
+            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + time.perf_counter() - self._begun
+            self._name = ""
+
+    @property
+    def total(self) -> float:
+        return time.perf_counter() - self._started
+
+
 Watched = Progress | bool | None
 """Who watches, as a caller says it: True is a bar, False nobody, None a bar on a terminal."""
 

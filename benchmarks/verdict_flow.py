@@ -37,8 +37,8 @@ from advsearch.attacks.candidates import Failures, FoundFailure
 from advsearch.attacks.trials import choose_rate_spp
 from advsearch.attacks.verification import OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.engine.journal import Journal, Shared
-from advsearch.engine.record import Findings, Stages
-from advsearch.progress import NullProgress
+from advsearch.engine.record import Findings
+from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import Attack
 from advsearch.tasks import Judgement, Prediction

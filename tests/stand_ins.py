@@ -19,8 +19,8 @@ from advsearch.attacks.verification import WORST_CASE, Rule
 from advsearch.cluster import BatchResult, InProcess, WorkerStats, WorkerTask
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Stages
-from advsearch.progress import NullProgress
+from advsearch.engine.record import Findings
+from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack.carry_out import attack_worker, search_size
 from advsearch.questions.attack.settings import AttackConfig

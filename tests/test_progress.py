@@ -17,8 +17,9 @@ from advsearch.attacks.trials import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
 from advsearch.cli.output import shown_text as check_text
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Stages
+from advsearch.engine.record import Findings
 from advsearch.experiment import run_experiment as answered
+from advsearch.progress import Stages
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check import check
 from advsearch.questions.check.result import CheckConfig

@@ -17,7 +17,6 @@ from advsearch.attacks.candidates import Bracket
 from advsearch.engine.transport import PredictedSearch
 from advsearch.interrupts import interruptible
 from advsearch.options import NOT_A_NUMBER, Value, count_outcomes
-from advsearch.progress import Progress
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME, ControlGroup, Fields, Result, VerifiedRate
@@ -64,31 +63,6 @@ class Findings:
         if self.sample_count is None:
             raise RuntimeError("the sample count of the verification has not been chosen yet")
         return self.sample_count.spp
-
-
-class Stages:
-    """Tells a watcher which stage runs, and keeps the seconds of each by name."""
-
-    def __init__(self, progress: Progress) -> None:
-        self.progress = progress
-        self.seconds: dict[str, float] = {}
-        self._name = ""
-        self._started = self._begun = time.perf_counter()
-
-    def begin(self, name: str, title: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        """End the stage before and begin another; a `name` that comes twice adds up. The rest: `Progress.stage`."""
-        self.end()
-        self._name, self._begun = name, time.perf_counter()
-        self.progress.stage(title, total, hint=hint, at_most=at_most)
-
-    def end(self) -> None:
-        if self._name:
-            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + time.perf_counter() - self._begun
-            self._name = ""
-
-    @property
-    def total(self) -> float:
-        return time.perf_counter() - self._started
 
 
 LOST = "(no answer)"  # the label of a picture that nobody could make; what the row keeps beside it says why

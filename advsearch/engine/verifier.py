@@ -29,10 +29,10 @@ from advsearch.cluster import Workers
 from advsearch.config import SceneConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import KEPT, Findings, Stages
+from advsearch.engine.record import KEPT, Findings
 from advsearch.engine.transport import PredictedSearch
 from advsearch.errors import InputError
-from advsearch.progress import Progress
+from advsearch.progress import Progress, Stages
 from advsearch.report.wording import count as plural
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_configuration

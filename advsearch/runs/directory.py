@@ -202,6 +202,15 @@ class RunDirectory:
         if self._tracker is not None:
             self._tracker.rows(rows)
 
+    @staticmethod
+    def locate_part(run: Path, name: str) -> Path:
+        """Return the folder of a part of a run, whether it exists or not."""
+        return run / PARTS / name
+
+    def write_file(self, name: str, data: bytes) -> Path:
+        """Write a file of the run, whose name is relative to the run directory, and return its path."""
+        return write_bytes(self.path / name, data)
+
     def save_image(self, name: str, image: Any, folder: str = IMAGES) -> Path:
         """Write ``<folder>/<name>.png`` of (H, W, 3) or (H, W), display-referred sRGB in [0, 1], numpy or torch; return
         its path."""

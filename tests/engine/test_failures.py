@@ -16,8 +16,8 @@ from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchRe
 from advsearch.attacks.candidates import Failures, FailureShare, FoundFailure
 from advsearch.attacks.verification import OVER_CONDITIONS, Rule
 from advsearch.cli.output import shown_text as text_of
-from advsearch.engine.record import Findings, Stages
-from advsearch.progress import NullProgress
+from advsearch.engine.record import Findings
+from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack.display import failures_part, failures_text
 from advsearch.questions.attack.outcome import described_failures
 from advsearch.questions.attack.stages import TRIED, Attack, check_failures

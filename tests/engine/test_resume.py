@@ -23,9 +23,8 @@ from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.attacks import Domain, Evaluated, Evaluation, Policy, Proposal, Query, make_policy
 from advsearch.engine.journal import Journal, Shared
-from advsearch.engine.record import Stages
 from advsearch.errors import FileFormatError, InputError, RunExistsError
-from advsearch.progress import NullProgress
+from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check.result import CheckConfig
 from advsearch.questions.stability.result import StabilityConfig

@@ -21,8 +21,9 @@ from advsearch.questions.sweep.result import OUTCOMES, Predictions, SweptAxis
 from advsearch.questions.test.result import FAILED, search_verdict, share_reason, tried_reason
 from advsearch.report.shown import shown
 from advsearch.report.wording import wanted
+from advsearch.rules import count_wrong_outcomes
 from advsearch.runs.store import Row
-from advsearch.runs.tables import count_wrong_outcomes, sweep_frame
+from advsearch.runs.tables import sweep_frame
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import Judgement, Prediction
 from advsearch.tasks.depth import Depth

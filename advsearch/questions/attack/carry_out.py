@@ -32,14 +32,13 @@ from advsearch.engine.judging import AnyObjective, Described, Looked, Metric, Me
 from advsearch.engine.loading import SCENE, Controls, Scene, framed
 from advsearch.engine.naming import AnyModel, load_models, model_name, several
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Stages
 from advsearch.engine.transport import CleanMatrix, refusal_of_matrices
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.address import AskedModel
 from advsearch.options import as_setting, told
-from advsearch.progress import NullProgress, Progress, Watched, watcher
+from advsearch.progress import NullProgress, Progress, Stages, Watched, watcher
 from advsearch.questions.attack import settings as numbers
 from advsearch.questions.attack.ambient import problems_by_key
 from advsearch.questions.attack.outcome import summarise

@@ -14,9 +14,10 @@ from advsearch.attacks.trials import MOST_TIMES, MOVED, OVER_LADDER
 from advsearch.engine.journal import Journal
 from advsearch.engine.judging import domain_of, print_terms
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Stages, control_group, lost_remarks, mean_number, verified_rate
+from advsearch.engine.record import Findings, control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.transport import remark
 from advsearch.options import OUT_OF_VIEW, Value
+from advsearch.progress import Stages
 from advsearch.questions.attack import result as kept
 from advsearch.questions.attack.result import AttackResult, KeptPicture
 from advsearch.questions.attack.settings import AttackConfig

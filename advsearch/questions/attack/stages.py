@@ -35,11 +35,12 @@ from advsearch.engine.gradients import Bench, inside
 from advsearch.engine.journal import PLAN, Journal, finite, other_numbers, same
 from advsearch.engine.judging import penalised
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Stages
+from advsearch.engine.record import Findings
 from advsearch.engine.surface_light import SurfaceLight
 from advsearch.engine.transport import CleanMatrix, PredictedSearch, Transport, refusal_of_matrices, remark
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.interrupts import interruptible
+from advsearch.progress import Stages
 from advsearch.questions.attack.ambient import find_ambient
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.wording import count

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -28,34 +28,21 @@ from advsearch.engine.record import control_group, verified_rate
 from advsearch.engine.transport import CleanMatrix
 from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.errors import ClusterError, FileFormatError
-from advsearch.experiment import Made, RunContext, run_experiment
+from advsearch.experiment import Made, RunContext, run_part
 from advsearch.files import JsonObject
 from advsearch.progress import Progress
 from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack import summary as results
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
-from advsearch.runs.directory import CONFIG, PARTS, default_name, is_run
-from advsearch.runs.listing import finished
-from advsearch.runs.results import INTERRUPTED, Result
-from advsearch.runs.summary import read_configuration, read_result
+from advsearch.runs.directory import PARTS, default_name, is_run
+from advsearch.runs.results import INTERRUPTED
+from advsearch.runs.summary import read_configuration
 from advsearch.scene.library import list_objects, load_object
-from advsearch.settings import FILES, Config
+from advsearch.settings import FILES
 from advsearch.statistics.intervals import clopper_pearson
 from advsearch.tasks import make_task
 from advsearch.trust.writing import LOCK, PART, storage_errors, write_bytes
-
-
-def carry_out_part(path: Path, config: Config, progress: Progress, ask: Callable[..., Result] | None = None) -> Result:
-    """Return the result of the part in the folder `path`; what is done of it is not done again. The configuration is
-    what it does, where it has not begun; `ask` carries it out, None as every question is."""
-    ask = ask or run_experiment
-    if not is_run(path) or not (path / CONFIG).is_file():
-        return ask(config.model_copy(update={"run": str(path), "overwrite": True}), progress=progress)
-    if finished(path):
-        return read_result(path)
-    return ask(type(config).from_yaml(path / CONFIG, config.asked), progress=progress, resumed=path)
-
 
 LONGEST = 6 * 3600.0  # Seconds that one attack may take on a worker before it counts as hanging
 TEXTS = (".json", ".html", ".yaml")  # Files that may say where the run is
@@ -185,7 +172,7 @@ class StudyRun:
         def ask(there: AttackConfig, **more: Any) -> AttackSummary:
             return attacking.attack_once(there, clean=clean, **more).summary
 
-        summary = carry_out_part(path, config, self.progress, ask)
+        summary = run_part(path, config, self.progress, ask)
         if not isinstance(summary, AttackSummary):
             raise FileFormatError(f"{path}: expected the run of an attack, got one of {summary.command}")
         self.warnings += [text for text in summary.warnings if text not in self.warnings]

@@ -15,12 +15,11 @@ from advsearch import seeds
 from advsearch.api.keywords import asks, configured
 from advsearch.engine.journal import check_made_of
 from advsearch.engine.naming import AnyModel, check_not_spread, check_run_settings, load_models, model_name
-from advsearch.engine.record import Stages
 from advsearch.errors import InputError, ModelError
 from advsearch.experiment import RunContext
 from advsearch.models.reference import trainable
 from advsearch.models.source import split_weights
-from advsearch.progress import Watched, watcher
+from advsearch.progress import Stages, Watched, watcher
 from advsearch.questions.attack.carry_out import LOADING, executor_for
 from advsearch.questions.harden import scenes
 from advsearch.questions.harden.detectors import DetectorCourse, Loss, SegmenterCourse, read_coco

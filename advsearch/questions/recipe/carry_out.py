@@ -16,10 +16,9 @@ from pydantic import ValidationError
 from advsearch.config import DEFAULT_ENVIRONMENT, SceneConfig, name_in
 from advsearch.controls import CONTROLS
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.experiment import RunContext
+from advsearch.experiment import RunContext, run_part
 from advsearch.questions.attack.carry_out import check_from_config
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.attack.summary import AttackSummary, FoundValue, SearchDistribution, attack_of
 from advsearch.questions.photographs.carry_out import Photographs, photographs_in
 from advsearch.questions.photographs.result import LOOSE_PHOTO, PHOTO
@@ -201,7 +200,7 @@ def _carried_out(runs: Sequence[PlannedRun], asked: RunContext[RecipeConfig]) ->
                 )
                 continue
             config = around(config, search.distribution, search.configuration or {})
-        result = carry_out_part(folder / run.name, config, asked.progress)
+        result = run_part(folder / run.name, config, asked.progress)
         assert isinstance(result, (AttackSummary, SweepSummary))
         done.append((run, result))
         if result.goes_on:

@@ -14,12 +14,12 @@ from advsearch.attacks.domain import batches
 from advsearch.attacks.evaluation import most_at_once
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Stages
 from advsearch.engine.surface_light import LIGHTS, SurfaceLight
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.experiment import RunContext
 from advsearch.options import OUT_OF_VIEW
+from advsearch.progress import Stages
 from advsearch.questions.attack.carry_out import LOADING, problem_from_config
 from advsearch.questions.attack.outcome import transport_of
 from advsearch.questions.attack.settings import AttackConfig

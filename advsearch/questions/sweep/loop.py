@@ -17,10 +17,10 @@ from advsearch.attacks.domain import batches
 from advsearch.cluster import InProcess, Workers
 from advsearch.engine.journal import Journal, Sent, Shared, finite, lost, other_numbers, same, worker_call
 from advsearch.engine.loading import framed
-from advsearch.engine.record import LOST, Stages, judgement_of, lost_remarks
+from advsearch.engine.record import LOST, judgement_of, lost_remarks
 from advsearch.interrupts import interruptible
 from advsearch.options import OUT_OF_VIEW
-from advsearch.progress import Progress
+from advsearch.progress import Progress, Stages
 from advsearch.questions.attack.result import save_marked
 from advsearch.questions.sweep import summary as results
 from advsearch.questions.sweep.display import sweep_figure

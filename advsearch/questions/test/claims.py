@@ -24,12 +24,12 @@ from advsearch.engine.journal import Journal, Shared, worker_call
 from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import ladder_of
 from advsearch.errors import InputError
+from advsearch.experiment import run_part
 from advsearch.files import JsonObject, JsonValue
 from advsearch.options import OUT_OF_VIEW, count_outcomes
 from advsearch.progress import Progress
 from advsearch.questions.attack.carry_out import executor_for, parts_of, problem_on
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.studies import carry_out_part
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.questions.test.counterexamples import (
     TRIALS,
@@ -86,7 +86,7 @@ class Trial:
         shared = {"workers": self.config.workers, "cluster": self.config.cluster}
         limited = {**shared, "seconds": seconds if math.isfinite(seconds) else None}
         own = config.model_copy(update=limited).with_only_here(config.only_here)
-        summary = carry_out_part(self.run.path / PARTS / asked.name, own, self.progress)
+        summary = run_part(self.run.path / PARTS / asked.name, own, self.progress)
         assert isinstance(summary, AttackSummary)
         self.warnings += summary.warnings
         verdict, reason = words.search_verdict(summary, own.model_copy(update={"steps": own.steps or summary.steps}))
