@@ -227,6 +227,22 @@ class ConditionRow(Fields):
     text: str
 
 
+AxisValue = int | float | str | tuple[float, float]  # a number, a name, or both ends of a part of a range
+
+
+class CountedPredictions(Fields):
+    """Configurations, and in how many of them the model is right."""
+
+    configurations: int = Field(description="how many were looked at")
+    correct: int = Field(description="right predictions")
+    accuracy: float | None = Field(
+        description="their share; where some share a [draw](drives.md), the mean over draws of the share of each; null "
+        "where there is no configuration"
+    )
+    interval: Interval | None = Field(description="of that share, 95 %; null where all are of one draw")
+    outcomes: Outcomes = optional(f"{WHAT_BECOMES} in the other ones; {ONLY_OF_BOXES}")
+
+
 class Extent(Fields):
     """A count with the interval of its share."""
 

@@ -32,13 +32,13 @@ from advsearch.questions.report.recorded import (
     tried_claims,
 )
 from advsearch.questions.report.result import ConditionShare, Evidence, EvidenceRun
-from advsearch.questions.sweep.summary import AxisValue, SweepSummary
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test.result import SuiteResult
 from advsearch.report import wording
 from advsearch.report.shown import Claim, claim, counted, nothing_claimed, share_text
 from advsearch.report.wording import interval_text, number_text, percent
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, find_run, is_run, typed_name
-from advsearch.runs.results import RUNNING, Interval, Result, VariedValue
+from advsearch.runs.results import RUNNING, AxisValue, Interval, Result, VariedValue
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Row, Store
 from advsearch.runs.summary import NAME as SUMMARY
