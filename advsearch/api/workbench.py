@@ -6,4 +6,9 @@ module of an experiment, which the command line reads for its help, imports it i
 
 from __future__ import annotations
 
+from advsearch.engine.verifier import Verifier as Verifier
+from advsearch.questions.attack.carry_out import LOADING as LOADING
+from advsearch.questions.attack.carry_out import problem_from_config as problem_from_config
+from advsearch.questions.sweep.predicting import prepare_surface_light as prepare_surface_light
 from advsearch.questions.sweep.stored import StoredSweep as StoredSweep
+from advsearch.runs.summary import read_configuration as read_configuration

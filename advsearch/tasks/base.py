@@ -22,7 +22,7 @@ from advsearch.copies import hand_copies
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
-from advsearch.options import FROM_RUN, NOT_A_NUMBER
+from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW
 
 Output = Any  # what a model returns for N pictures: a tensor (N, ...), or a list with one thing for each picture
 Truth = Any  # what is true of a scene, as its task needs it: the right classes, a number, boxes
@@ -84,6 +84,11 @@ class Judgement:
     def not_a_number(self) -> bool:
         """Whether the model returned NaN or infinity, which is neither right nor a success."""
         return self.prediction.label == NOT_A_NUMBER
+
+    @property
+    def out_of_view(self) -> bool:
+        """Whether the object is not in the picture, so that the prediction is neither right nor wrong."""
+        return self.prediction.label == OUT_OF_VIEW
 
 
 Said = tuple[Prediction, JsonValue]  # what a model says of a picture, and what else is kept of it
