@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from advsearch import __version__ as __version__
 
 if TYPE_CHECKING:
+    from advsearch import rules as rules
     from advsearch import seeds as seeds
     from advsearch import settings as settings
     from advsearch import statistics as statistics
@@ -115,6 +116,7 @@ _MODULES = {
     "library": "advsearch.scene.library",
     "parts": "advsearch.scene.parts",
     "results": "advsearch.runs.results",
+    "rules": "advsearch.rules",
     "seeds": "advsearch.seeds",
     "settings": "advsearch.settings",
     "statistics": "advsearch.statistics",

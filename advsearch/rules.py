@@ -23,7 +23,7 @@ import pandas as pd
 
 from advsearch import seeds
 from advsearch.errors import InputError
-from advsearch.options import OUT_OF_VIEW
+from advsearch.options import OUT_OF_VIEW, Outcome
 from advsearch.runs.results import ConditionRow
 from advsearch.statistics.clustered import fewer_by_chance, mean_share, per_unit, share_interval
 
@@ -66,9 +66,18 @@ def observed(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     return found
 
 
-def is_shown(rows: pd.DataFrame) -> Mask:
-    """Return in which rows of a sweep (n,) what is judged is in the picture."""
+def is_in_view(rows: pd.DataFrame) -> Mask:
+    """Return in which rows of a sweep (n,) the judged object is in the image."""
     return np.asarray(rows["label"] != OUT_OF_VIEW)
+
+
+def count_wrong_outcomes(rows: pd.DataFrame) -> dict[str, int] | None:
+    """Count the outcomes of the rows that are not right, by name; None where rows have no outcomes."""
+    if "outcome" not in rows:
+        return None
+    counts = rows.loc[rows["correct"] != 1, "outcome"].astype(str).value_counts()
+    counts_by_name = {outcome.value: int(counts[outcome.value]) for outcome in Outcome if outcome.value in counts}
+    return counts_by_name or None
 
 
 def interval_of(table: pd.DataFrame) -> tuple[float, float]:

@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from advsearch.questions.explain.findings import find_importance
+from advsearch.questions.explain.importance import find_importance
 from advsearch.rules import find_rules, halves
 from advsearch.statistics.clustered import fewer_by_chance, mean_interval, paired_by_unit, share_interval
 

@@ -286,11 +286,12 @@ def weigh(found: Counted, counts: dict[str, tuple[int, int]], common: dict[str, 
 
 def explain(run: Path, told: dict[str, Any]) -> Counted:
     """Each rule: its fresh renders, and the rows of the half that did not choose."""
-    from advsearch.questions.explain.renders import AskedSweep, read_predictions
+    from advsearch.questions.explain.rows import read_predictions
+    from advsearch.questions.sweep.stored import StoredSweep
     from advsearch.rules import halves, observed
 
     found, summary = Counted(), json.loads((run / "summary.json").read_text())
-    rows = read_predictions([AskedSweep.of(Path(name)) for name in summary["sweeps"]])
+    rows = read_predictions([StoredSweep.read(Path(name)) for name in summary["sweeps"]])
     rows = rows[rows["label"] != "out of view"].reset_index(drop=True)
     _, left = halves(observed(rows, rows.attrs["units"]), 0)
     before: list[list[dict[str, Any]]] = []

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from advsearch.questions.explain.findings import find_importance
+from advsearch.questions.explain.importance import find_importance
 from advsearch.rules import CountedRule, Mask, covered, find_rules, halves, observed
 
 Numbers = npt.NDArray[np.float64]

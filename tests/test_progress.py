@@ -24,7 +24,7 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check import check
 from advsearch.questions.check.result import CheckConfig
 from advsearch.questions.precision.result import PrecisionConfig
-from advsearch.questions.region import growing as region
+from advsearch.questions.region import boxes
 from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.carry_out import sweep_from_config
 from advsearch.questions.sweep.settings import SweepConfig
@@ -162,7 +162,7 @@ def test_samples_of_the_ladder_have_a_bound() -> None:
     assert not count.converged and spent <= most_samples(2) == 2 * 8 * 340
 
 
-@pytest.mark.parametrize("most", [region.MOST_PROBED, 60])
+@pytest.mark.parametrize("most", [boxes.MAX_PROBED, 60])
 def test_the_pictures_of_growing_a_box_have_a_bound(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     generator, pictures, checked = torch.Generator().manual_seed(0), 0, list[int]()
 
@@ -171,9 +171,9 @@ def test_the_pictures_of_growing_a_box_have_a_bound(most: int, monkeypatch: pyte
         pictures += 1
         return float(u.mean()) + 0.05 * float(torch.randn((), generator=generator)) < 0.6
 
-    monkeypatch.setattr(region, "MOST_PROBED", most)
-    region.grow(same, torch.full((3,), 0.5), seed=0, samples=20, on_check=lambda: checked.append(pictures))
-    assert 100 < checked[0] <= 3 * most and 1 <= len(checked) <= region.ATTEMPTS
+    monkeypatch.setattr(boxes, "MAX_PROBED", most)
+    boxes.grow(same, torch.full((3,), 0.5), seed=0, samples=20, on_check=lambda: checked.append(pictures))
+    assert 100 < checked[0] <= 3 * most and 1 <= len(checked) <= boxes.ATTEMPTS
 
 
 # ---- with the renderer ----------------------------------------------------------------------------------------------

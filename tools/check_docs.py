@@ -36,7 +36,7 @@ from advsearch.models.loading import SOURCES as SOURCES_OF_MODELS
 from advsearch.questions.attack import stages
 from advsearch.questions.attack.settings import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
-from advsearch.questions.region import growing as mapping
+from advsearch.questions.region import boxes, growing
 from advsearch.questions.region.result import RegionConfig
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.questions.test import counterexamples as tested
@@ -245,7 +245,7 @@ def _looks() -> tuple[int, int, int]:
 def _exceptions(samples: int) -> float:
     """The share of a box that may have another verdict, where all samples agree."""
     nothing = torch.zeros(1)
-    return 1.0 - mapping.GrownBox(nothing, nothing, nothing, samples, samples, samples).interval[0]
+    return 1.0 - boxes.GrownBox(nothing, nothing, nothing, samples, samples, samples).interval[0]
 
 
 def _draws(mean: float, value: float = 1.0) -> int:
@@ -273,10 +273,10 @@ MADE_BY_HAND = [
     ),
     ("questions.md", f"**Verified** on up to {TRIALS_OVER} conditions"),
     ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
-    ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),
-    ("questions.md", {8: "as long as eight random pictures"}[mapping.PROBES]),
-    ("questions.md", {4: "with other seeds, up to four times"}[mapping.ATTEMPTS]),
-    ("questions.md", f"First come {mapping.AT_CENTRE} trials of the centre"),
+    ("questions.md", {8: "in one to eight parameters"}[growing.MAX_PARAMETERS]),
+    ("questions.md", {8: "as long as eight random pictures"}[boxes.PROBES]),
+    ("questions.md", {4: "with other seeds, up to four times"}[boxes.ATTEMPTS]),
+    ("questions.md", f"First come {growing.CENTRE_TRIALS} trials of the centre"),
     ("questions.md", f"Then come {RegionConfig.model_fields['samples'].default} fresh samples"),
     ("questions.md", f"at most {100 * _exceptions(200):.1f} % of the box has another verdict"),
     ("testing.md", "takes {} of them, *at least 0.99* {}, and".format(*map(_draws, (0.95, 0.99)))),

@@ -312,9 +312,9 @@ FAULTS = (
     ),
     Fault(
         "explain: what chance adds is not taken off",
-        "advsearch/questions/explain/findings.py",
-        "share = 1.0 - (1.0 - counted) * (n - 1) / max(n - k, 1)",
-        "share = counted",
+        "advsearch/questions/explain/importance.py",
+        "corrected_share = 1.0 - (1.0 - share) * (n_rows - 1) / max(n_rows - n_groups, 1)",
+        "corrected_share = share",
         ("tests/questions/test_rules.py",),
     ),
     Fault(

@@ -46,6 +46,7 @@ from advsearch.engine.record import control_group as control_group
 from advsearch.engine.record import verified_rate as verified_rate
 from advsearch.engine.verifier import RetrialCondition as RetrialCondition
 from advsearch.engine.verifier import Retrials as Retrials
+from advsearch.engine.verifier import Verifier as Verifier
 from advsearch.engine.verifier import kept_configuration as kept_configuration
 from advsearch.engine.verifier import ladder_of as ladder_of
 from advsearch.options import count_outcomes as count_outcomes
@@ -74,8 +75,11 @@ from advsearch.questions.photographs.result import LOOSE_PHOTO as LOOSE_PHOTO
 from advsearch.questions.photographs.result import PHOTO as PHOTO
 from advsearch.questions.sweep.carry_out import row_parameters as row_parameters
 from advsearch.questions.sweep.display import surface_sentences as surface_sentences
+from advsearch.questions.sweep.predicting import prepare_surface_light as prepare_surface_light
+from advsearch.questions.sweep.stored import StoredSweep as StoredSweep
 from advsearch.registry import get_experiment as get_experiment
 from advsearch.registry import imported
+from advsearch.runs.summary import read_configuration as read_configuration
 from advsearch.runs.tables import units_of as units_of
 from advsearch.scene.assembly import posed as posed
 from advsearch.scene.glb import glb as glb

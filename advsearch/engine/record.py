@@ -15,7 +15,7 @@ from advsearch.attacks.candidates import Bracket
 from advsearch.engine.transport import PredictedSearch
 from advsearch.options import NOT_A_NUMBER, Value, count_outcomes
 from advsearch.report.wording import count
-from advsearch.runs.results import ControlGroup, VerifiedRate
+from advsearch.runs.results import ControlGroup, LinearTransport, VerifiedRate
 from advsearch.runs.store import Row
 from advsearch.scene.predictor import Refusal
 from advsearch.tasks import Judgement, Prediction
@@ -58,6 +58,15 @@ class Findings:
         if self.sample_count is None:
             raise RuntimeError("the sample count of the verification has not been chosen yet")
         return self.sample_count.spp
+
+    @property
+    def transport_summary(self) -> LinearTransport:
+        """What predicted the images of the searches, and how far it was off; or why nothing did."""
+        if self.transport is None:
+            return LinearTransport(used=False, reason=str(self.rendered_because or "nothing was searched"))
+        predicted = self.transport.summary()
+        surface_refused = str(self.surface_refused) if self.surface_refused else None
+        return predicted.model_copy(update={"reason": predicted.reason or surface_refused})
 
 
 LOST = "(no answer)"  # the label of a picture that nobody could make; what the row keeps beside it says why

@@ -66,6 +66,11 @@ class Verifier:
     _clean_kind: str = "control"
     _asked: set[tuple[str, int]] = field(default_factory=set)
 
+    @classmethod
+    def open(cls, run: RunDirectory, problem: Problem, config: SceneConfig, stages: Stages) -> Verifier:
+        """Return what makes the trials of a run in this process, and stores them."""
+        return cls(Journal(run, Shared(problem)), ladder_of(config), stages)
+
     def __post_init__(self) -> None:
         self.problem: Problem = self.journal.problem
 
@@ -163,14 +168,25 @@ class Verifier:
         for evaluation in self.evaluate_all(queries, predictor=predictor):
             yield evaluation.said
 
+    def trials_of(
+        self, kind: str, count: int, find_configuration: Callable[[int], Tensor], *, sought: bool = True,
+        predictor: PredictedSearch | None = None,
+    ) -> Iterator[Judgement]:  # fmt: skip
+        """Try configurations of a kind, numbered from 0, in batches that fit into memory; see `trials`."""
+        for numbers in batches(0, count, most_at_once(self.problem.domain.dim)):
+            configurations = {number: find_configuration(number) for number in numbers}
+            yield from self.trials(kind, configurations, sought=sought, predictor=predictor)
+
     def average(self, count: int) -> None:
         """Try configurations drawn from the whole space and budget: how often the model is wrong on average."""
-        problem, judgements = self.problem, list[Judgement]()
+        problem = self.problem
         self.begin("trying random configurations", count, name="average", flags="`average`")
-        for numbers in batches(0, count, most_at_once(problem.domain.dim)):
-            rngs = {n: torch.Generator().manual_seed(seeds.stream(problem.seed, "draw", n)) for n in numbers}
-            judgements += self.trials("average", {n: problem.domain.sample(rng)[0] for n, rng in rngs.items()})
-        self.findings.average = tuple(judgements)
+
+        def draw(number: int) -> Tensor:
+            generator = torch.Generator().manual_seed(seeds.stream(problem.seed, "draw", number))
+            return problem.domain.sample(generator)[0]
+
+        self.findings.average = tuple(self.trials_of("average", count, draw))
 
     def begin(
         self, title: str, trials: int, *, name: str = "verification", flags: str = "`trials` or `verify_spp`",

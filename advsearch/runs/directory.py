@@ -231,6 +231,11 @@ class RunDirectory:
         self.record(store.Row(kind, step, **columns))
 
     @staticmethod
+    def locate_config(run: Path) -> Path:
+        """Return the file of the settings of a run."""
+        return run / CONFIG
+
+    @staticmethod
     def locate_part(run: Path, name: str) -> Path:
         """Return the folder of a part of a run, whether it exists or not."""
         return run / PARTS / name

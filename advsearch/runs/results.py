@@ -227,6 +227,40 @@ class ConditionRow(Fields):
     text: str
 
 
+AxisValue = int | float | str | tuple[float, float]  # a number, a name, or both ends of a part of a range
+
+
+class CountedPredictions(Fields):
+    """Configurations, and in how many of them the model is right."""
+
+    configurations: int = Field(description="how many were looked at")
+    correct: int = Field(description="right predictions")
+    accuracy: float | None = Field(
+        description="their share; where some share a [draw](drives.md), the mean over draws of the share of each; null "
+        "where there is no configuration"
+    )
+    interval: Interval | None = Field(description="of that share, 95 %; null where all are of one draw")
+    outcomes: Outcomes = optional(f"{WHAT_BECOMES} in the other ones; {ONLY_OF_BOXES}")
+
+
+class Extent(Fields):
+    """A count with the interval of its share."""
+
+    what: str = Field(description="what was counted")
+    count: int
+    total: int = Field(alias="of")
+    interval: Interval = Field(description="95 %, of the share")
+    share: float | None = Field(
+        default=None, description="the mean over draws of the share of each, where some share one; absent elsewhere"
+    )
+
+    @classmethod
+    def of(cls, what: str, count: int, total: int, interval: Interval | None, share: float | None = None) -> Extent:
+        """Return a count with the interval of its share, which is `share` where that is not count over total."""
+        own_share = share if total and share != count / total else None
+        return cls(what=what, count=count, total=total, interval=interval or (0.0, 1.0), share=own_share)
+
+
 class StudyResult(RunResult):
     """What several attacks found; each is a run of its own in the folder `parts`."""
 

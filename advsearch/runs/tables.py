@@ -18,7 +18,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from advsearch.errors import FileFormatError
-from advsearch.options import NOT_A_NUMBER, Outcome, get_outcome
+from advsearch.options import NOT_A_NUMBER, get_outcome
 from advsearch.runs.export import as_columns, as_record, each_value
 from advsearch.runs.store import NAME, Row, Store
 
@@ -93,15 +93,6 @@ def units_of(store: Store, *, is_drawn: bool = True) -> Units | None:
         if has_frames and prod(units.sizes) * units.samples * units.noise * units.models <= MOST_ROWS:
             return units
     raise FileFormatError(f"{store.path}: expected what units of sampling are, got {str(noted)[:80]}")
-
-
-def count_wrong_outcomes(rows: pd.DataFrame) -> dict[str, int] | None:
-    """Count the outcomes of rows of a frame that are not right; None where they have none."""
-    if "outcome" not in rows:
-        return None
-    counts = rows.loc[rows["correct"] != 1, "outcome"].astype(str).value_counts()
-    named = {one.value: int(counts[one.value]) for one in Outcome if one.value in counts}
-    return named or None
 
 
 KIND = "sweep"  # rows of the sweep itself

@@ -27,7 +27,7 @@ from advsearch.questions.attack.display import claims
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.questions.region import growing, region
+from advsearch.questions.region import boxes, growing, region
 from advsearch.questions.region.result import RegionConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed_runs
@@ -147,7 +147,7 @@ SMALL: dict[str, Any] = {"object": "mug", "resolution": 16, "denoise": "none"}
 
 
 def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("advsearch.questions.region.growing.MOST_PROBED", 20)
+    monkeypatch.setattr(boxes, "MAX_PROBED", 20)
     config = RegionConfig(
         **SMALL, controls={"pose": {"yaw": [10, 50], "pitch": 0, "roll": 0, "x": 0, "z": 0}, "camera.elevation": {}},
         vary="pose.yaw,camera.elevation", samples=8, map=2, verify_spp=2, run=str(tmp_path / "run"),
@@ -173,9 +173,9 @@ def test_a_region_that_is_interrupted_says_how_to_go_on(
     def stopped(*_: Any, **__: Any) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(growing, "grow", stopped)
+    monkeypatch.setattr(boxes, "grow", stopped)
     monkeypatch.setattr(
-        growing, "_verdict", lambda verifier, centre: next(verifier.trials("centre", {0: centre})).success
+        growing, "find_verdict", lambda verifier, centre: next(verifier.trials("centre", {0: centre})).success
     )
     folder = tmp_path / "run"
     flags = (

@@ -41,7 +41,7 @@ from advsearch.attacks.verification import (
 )
 from advsearch.errors import InputError
 from advsearch.questions.attack.settings import FEWEST_TRIALS
-from advsearch.questions.region.growing import GrownBox
+from advsearch.questions.region.boxes import GrownBox
 from advsearch.questions.region.result import FEWEST_SAMPLES
 from advsearch.seeds import stream
 from advsearch.statistics.paired import paired_difference

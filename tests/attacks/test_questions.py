@@ -13,7 +13,7 @@ from torch import Tensor
 from advsearch.attacks import Block, Domain, Evaluation, Query, make_policy, search
 from advsearch.attacks.candidates import RATIO, Bracket, confirmed, scaled, shrunk, smallest
 from advsearch.errors import InputError
-from advsearch.questions.region.growing import grow
+from advsearch.questions.region.boxes import grow
 
 NORMS = {"linf": lambda w: float(w.abs().sum()), "l2": lambda w: float(w.norm())}
 

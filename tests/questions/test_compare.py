@@ -17,6 +17,7 @@ from stored_sweeps import described
 import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError
+from advsearch.experiment import RunContext
 from advsearch.options import Value
 from advsearch.questions.compare import CompareConfig
 from advsearch.questions.compare.result import ComparedPair, CompareResult
@@ -294,14 +295,14 @@ def test_a_comparison_that_was_stopped_goes_on(
 ) -> None:
     parts: list[str] = []
 
-    def swept(path: Path, config: SweepConfig, progress: object) -> SweepSummary:
+    def swept(self: Any, name: str, config: SweepConfig) -> SweepSummary:
         parts.append(config.model)
         if len(parts) == 1:
             return sweep(ending="interrupted")
-        stored(path, {"a": good, "b": low})
+        stored(tmp_path / "run" / "parts" / name, {"a": good, "b": low})
         return sweep(ending="finished")
 
-    monkeypatch.setattr("advsearch.questions.attack.studies.carry_out_part", swept)
+    monkeypatch.setattr(RunContext, "run_part", swept)
     line = ["compare", "a", "b", "--object", "mug", "--control", "camera", "--pictures", "0"]
     assert main([*line, "--run", str(tmp_path / "run")]) == 130
     assert f"Go on with: advsearch resume {tmp_path / 'run'}" in capsys.readouterr().out

@@ -18,12 +18,15 @@ from stored_sweeps import described, make_sweep, seen
 import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError
+from advsearch.experiment import RunContext
 from advsearch.progress import NullProgress
 from advsearch.questions.explain import renders as explaining
-from advsearch.questions.explain.findings import find_importance
-from advsearch.questions.explain.renders import along, can_be_given, sweep_inside
+from advsearch.questions.explain.importance import find_importance
 from advsearch.questions.explain.result import ExplainResult, pairs_text
+from advsearch.questions.explain.rows import read_predictions
+from advsearch.questions.explain.sweeps import is_settable, sweep_along, sweep_inside
 from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.stored import StoredSweep
 from advsearch.rules import CountedRule, RuleCondition, covered, find_rules, halves, merge_repeats, observed
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import NAME, Row, Store
@@ -110,7 +113,7 @@ def test_a_rule_is_confirmed_by_what_is_rendered_inside_it(
         elevation = np.where(outside, 10.0, 70.0)
         return pd.DataFrame({"camera.elevation": elevation, "correct": outside, "unit": np.arange(10), "label": ""})
 
-    monkeypatch.setattr(explaining.Renders, "_rendered", rendered)
+    monkeypatch.setattr(explaining.Renders, "render_rows", rendered)
     result = advsearch.explain(swept, confirm=10, pairs=0, clusters=0, run=tmp_path / "run")
     confirmed = result.rules[0].confirmed
     assert confirmed is not None and (confirmed.right, confirmed.total) == (0, 9)  # what lies outside is not counted
@@ -157,8 +160,8 @@ def test_fresh_pictures_vary_as_the_sweep_did_and_count_beyond_the_rules_before(
         made = {"camera.elevation": elevation, "correct": elevation <= 70, "unit": np.arange(40)}
         return pd.DataFrame({**made, "label": ""})
 
-    monkeypatch.setattr(explaining.Renders, "_rendered", rendered)
-    rows = explaining.read_predictions([explaining.AskedSweep.of(swept)])
+    monkeypatch.setattr(explaining.Renders, "render_rows", rendered)
+    rows = read_predictions([StoredSweep.read(swept)])
     whole = observed(rows, rows.attrs["units"])
     below, above = whole["camera.elevation"] <= 50, whole["camera.elevation"] > 70
     rules = [
@@ -168,8 +171,8 @@ def test_fresh_pictures_vary_as_the_sweep_did_and_count_beyond_the_rules_before(
     asked: Any = SimpleNamespace(
         config=SimpleNamespace(confirm=20, seed=0), progress=NullProgress(), run=SimpleNamespace(path=tmp_path)
     )
-    renders = explaining.Renders(asked, [explaining.AskedSweep.of(swept)], rows, whole)
-    first, second = (renders.confirmed(rules, number) for number in range(2))
+    renders = explaining.Renders(asked, [StoredSweep.read(swept)], rows, whole)
+    first, second = (renders.confirm_rule(rules, number) for number in range(2))
     assert first is not None and (first.right, first.total, first.held) == (0, 7, True)
     assert second is not None and (second.right, second.total, second.held) == (13, 13, False), "not those of the first"
 
@@ -182,10 +185,10 @@ def test_the_nearest_right_prediction_differs_in_one_value(
         assert isinstance(high, list) and isinstance(power, list) and min(len(high), len(power)) == 1
         made = pd.DataFrame({"camera.elevation": a, "light.power": b} for a in high for b in power)
         right = made["camera.elevation"] <= HIGH
-        self.count += len(made)
+        self.n_renders += len(made)
         return made.assign(correct=right, label=np.where(right, "mug", "bowl"))
 
-    monkeypatch.setattr(explaining.Renders, "_rendered", rendered)
+    monkeypatch.setattr(explaining.Renders, "render_rows", rendered)
     result = advsearch.explain(swept, confirm=0, pairs=1, clusters=0, run=tmp_path / "run")
     (pair,) = result.pairs
     assert pair.parameter == "camera.elevation" and float(pair.wrong_at) > HIGH >= float(pair.right_at) > 50.0
@@ -204,7 +207,7 @@ def test_nothing_is_counted_of_failures_for_which_nothing_was_rendered(
     def refuse(*given: Any) -> Any:
         raise InputError("a file names Python code that nobody allowed")
 
-    monkeypatch.setattr(explaining, "carry_out_part", refuse)
+    monkeypatch.setattr(RunContext, "run_part", refuse)
     result = advsearch.explain(swept, confirm=0, pairs=3, clusters=0, run=tmp_path / "run")
     assert (result.renders, result.pairs_sought, result.pairs) == (0, 0, [])
     text = str(result)
@@ -216,10 +219,13 @@ def test_typical_failures_take_turns_between_rules_and_those_under_none() -> Non
     table = seen({"yaw": [1.0, 2.0, 3.0, 9.0, 10.0]}, np.array([False, False, False, False, True]))
     under = table["yaw"] <= 5.0
     rule = CountedRule((RuleCondition("yaw", high=5.0),), table[under], table[~under])
-    order = explaining.typical_failures(table, [rule], 12)
+    order = explaining.find_typical_failures(table, [rule], 12)
     assert [index for index, _ in order[:2]] == [1, 3] and {index for index, _ in order[2:]} == {0, 2}
     assert order[0][1] == rule.conditions and order[1][1] == ()
-    assert explaining.typical_failures(table, [], 2)[0][1] == () and len(explaining.typical_failures(table, [], 2)) == 2
+    assert (
+        explaining.find_typical_failures(table, [], 2)[0][1] == ()
+        and len(explaining.find_typical_failures(table, [], 2)) == 2
+    )
 
 
 def test_what_cannot_be_explained_is_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -289,11 +295,11 @@ def test_a_sweep_along_a_factor_keeps_the_rest() -> None:
     row: dict[str, float | str] = {
         "object": "bowl", "environment": "noon", "model": "reference", "pose.yaw": 90.0, "light.power": 0.5,
     }  # fmt: skip
-    made = along(config, row, "pose.yaw", TABLE, 3)
+    made = sweep_along(config, row, "pose.yaw", TABLE, 3)
     assert made.object == "bowl" and made.environment == "noon" and made.controls == {} and made.keep_pictures == "all"
     assert made.grid["pose.yaw"][0] == 90.0 and len(made.grid["pose.yaw"]) == 9  # type: ignore[index, arg-type]
     assert made.grid["light.power"] == [0.5] and made.plain()["set"] == {} and made.workers is None
-    lit = along(config, row, "environment", TABLE, 3)
+    lit = sweep_along(config, row, "environment", TABLE, 3)
     assert lit.environment == "noon,studio" and lit.grid["pose.yaw"] == [90.0]
 
 
@@ -305,8 +311,8 @@ def test_numbers_that_follow_from_others_and_axes_are_not_asked_for_again() -> N
     values = {"path.time": [0.0, 1.0], "path.distance": [5.0, 4.0], "camera.fov": [30.0, 40.0]}
     table = seen(values, np.array([False, True]))
     drive = SweepConfig(object="mug", path="approach", fps=1.0, controls={"path": {"reach": 8.0}})
-    made = along(drive, row, "path.time", table, 3)
-    assert list(made.grid) == ["path.time"] and not can_be_given(drive, "path.distance")
+    made = sweep_along(drive, row, "path.time", table, 3)
+    assert list(made.grid) == ["path.time"] and not is_settable(drive, "path.distance")
     assert made.controls == {"path": {"reach": 8.0}}, "as far as the drive went"
     conditions = tuple(RuleCondition(name, low=0.0) for name in values)
     assert sweep_inside(drive, table, conditions, 20, 7).controls == {"path": {"reach": 8.0}}
@@ -330,13 +336,13 @@ def test_failures_are_grouped_by_what_the_model_decides_by(
 ) -> None:
     asked: list[int] = []
 
-    def again(config: SweepConfig, numbers: Any, progress: Any) -> tuple[torch.Tensor, Read]:
+    def again(self: Any, sweep: StoredSweep, numbers: Any) -> tuple[torch.Tensor, Read]:
         """Dark pictures of even rows and light ones of odd rows."""
         asked.extend(numbers)
         shades = torch.tensor([0.2 + 0.6 * (number % 2) for number in numbers])
         return shades[:, None, None, None].expand(-1, 4, 4, 3), Read()
 
-    monkeypatch.setattr(explaining, "pictures_again", again)
+    monkeypatch.setattr(explaining.Renders, "render_again", again)
     result = advsearch.explain(swept, confirm=0, pairs=0, clusters=50, run=tmp_path / "run")
     found = result.clusters
     assert found is not None and found.apart and found.failures == 50 == len(set(asked)) and result.renders == 50
@@ -360,11 +366,11 @@ def test_failures_of_all_sweeps_of_a_model_are_grouped_together(
     third = stored(tmp_path / "third", lambda elevation: elevation > HIGH, model="third")
     asked: list[str] = []
 
-    def again(config: SweepConfig, numbers: Any, progress: Any) -> tuple[torch.Tensor, Read]:
-        asked.append(config.model)
+    def again(self: Any, sweep: StoredSweep, numbers: Any) -> tuple[torch.Tensor, Read]:
+        asked.append(sweep.config.model)
         return torch.full((len(numbers), 4, 4, 3), 0.6 * len(asked) - 0.4), Read()
 
-    monkeypatch.setattr(explaining, "pictures_again", again)
+    monkeypatch.setattr(explaining.Renders, "render_again", again)
     result = advsearch.explain([swept, second, third], confirm=0, pairs=0, clusters=60, run=tmp_path / "run")
     found = result.clusters
     assert asked == ["reference"] * 2 and found is not None and found.failures == 60

@@ -10,8 +10,9 @@ import pytest
 from stand_ins import Impatient, rows
 
 from advsearch.engine import acceptance
-from advsearch.questions.region import growing, region
+from advsearch.questions.region import boxes, growing, region
 from advsearch.questions.region.result import RegionConfig, RegionResult
+from advsearch.questions.sweep import predicting
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
 from advsearch.scene.surface import arrangement, texels
@@ -29,8 +30,8 @@ def coarse() -> Iterator[None]:
         patched.setattr(texels, "GROUND", 32)
         for module, name, value in (
             (arrangement, "SIDE", 48), (arrangement, "GATHERED", 64), (acceptance, "CHECK_SPP", 4),
-            (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (growing, "MOST_PROBED", 20),
-            (growing, "pays_from", lambda *_: 1),
+            (acceptance, "BOUND", 50.0), (acceptance, "MARGIN", 50.0), (boxes, "MAX_PROBED", 20),
+            (predicting, "pays_from", lambda *_: 1),
         ):  # fmt: skip
             patched.setattr(module, name, value)
         yield
@@ -54,7 +55,7 @@ def test_viewpoints_are_predicted_and_fresh_samples_are_rendered(whole: tuple[Pa
     assert predicted and found.count(("map", True, 4)) == 9 and len(found) == predicted + checked + 9
     assert result.renders["products"] == predicted + 9
     compared = 3 * acceptance.FIRST
-    assert result.renders["verification"] == growing.AT_CENTRE + checked + compared
+    assert result.renders["verification"] == growing.CENTRE_TRIALS + checked + compared
 
 
 class Stopping(Impatient):
@@ -84,7 +85,7 @@ def test_what_is_rendered_says_why(
     more: dict[str, Any], reason: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is said where that was asked for, or where more moves than a camera."""
-    monkeypatch.setattr(growing, "pays_from", lambda *_: 999)
+    monkeypatch.setattr(predicting, "pays_from", lambda *_: 999)
     config = RegionConfig(**{**SMALL, "map": 0, "verify_spp": 2, **more}, run=str(tmp_path / "run"))
     result = region.run(config)
     assert "products" not in result.renders

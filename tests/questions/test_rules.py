@@ -11,7 +11,9 @@ from scipy.stats import fisher_exact
 from stored_sweeps import seen
 
 from advsearch.errors import InputError
-from advsearch.questions.explain.findings import find_clusters, find_envelope, find_importance
+from advsearch.questions.explain.clusters import find_clusters
+from advsearch.questions.explain.envelope import find_envelope
+from advsearch.questions.explain.importance import find_importance
 from advsearch.rules import CountedRule, RuleCondition, covered, find_rules, halves, import_library, interval_of
 
 NOISE = 0.05

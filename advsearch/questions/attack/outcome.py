@@ -24,7 +24,7 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import UNPRINTED
 from advsearch.questions.attack.summary import AttackSummary, DifferentFailures
 from advsearch.report.wording import number_text
-from advsearch.runs.results import LinearTransport, SharedWork, VariedValue
+from advsearch.runs.results import SharedWork, VariedValue
 from advsearch.runs.summary import write_configuration
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import Task, mean
@@ -139,7 +139,7 @@ def _seen(problem: Problem, findings: Findings, clean: KeptPicture, adversarial:
         "answer_from": "random" if findings.beaten is not None else None,
         "policy_verified": findings.beaten and verified_rate(findings.beaten),
         "failures": described_failures(problem, findings),
-        "transport": transport_of(findings),
+        "transport": findings.transport_summary,
         "sample_count": findings.sample_count,
         "renders": _renders(findings, problem),
         **_searched(problem, findings.search, adversarial),
@@ -295,15 +295,6 @@ def _conditions(problem: Problem) -> dict[str, VariedValue]:
         else:
             varied[group.name] = VariedValue(unit=unit, names=[number_text(value) for value in dict.fromkeys(values)])
     return varied
-
-
-def transport_of(findings: Findings) -> LinearTransport:
-    """Return what predicted the pictures of the searches, and how far it was off; or why nothing did."""
-    if findings.transport is None:
-        return LinearTransport(used=False, reason=str(findings.rendered_because or "nothing was searched"))
-    predicted = findings.transport.summary()
-    surface_refused = str(findings.surface_refused) if findings.surface_refused else None
-    return predicted.model_copy(update={"reason": predicted.reason or surface_refused})
 
 
 def _renders(findings: Findings, problem: Problem) -> dict[str, int]:

@@ -8,17 +8,24 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import ValidatorFunctionWrapHandler, field_validator, model_validator
 
-from advsearch.config import SceneConfig
-from advsearch.errors import InputError
-from advsearch.experiment import PositionalArgument, RunContext, experiment
+from advsearch.extend import (
+    InputError,
+    PositionalArgument,
+    RunContext,
+    RunDirectory,
+    SceneConfig,
+    SweepConfig,
+    experiment,
+    find_run,
+    results,
+    setting,
+    setting_as_in,
+    settings,
+)
 from advsearch.questions.compare.result import ComparedPair, ComparedSide, CompareResult, claims, shown
-from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.runs.directory import PARTS, find_run
-from advsearch.runs.results import INTERRUPTED
-from advsearch.settings import each_once, names_together, setting, setting_as_in, settings, split_names, texts
 
 if TYPE_CHECKING:
-    from advsearch.questions.compare.pairs import Side
+    from advsearch.questions.compare.sides import Side
 
 ALWAYS = ("compared", "pictures", "seed", "threads", "deterministic", "run", "overwrite")
 """The settings that mean something for stored sweeps, too."""
@@ -51,8 +58,8 @@ class CompareConfig(SweepConfig):
     keep_pictures: Literal["all", "wrong", "none"] = setting_as_in(SweepConfig, "keep_pictures", default="wrong")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/WHAT-compare-NNN")
 
-    _named = texts(several=["compared"])
-    _different = each_once("compared")
+    _named = settings.texts(several=["compared"])
+    _different = settings.each_once("compared")
 
     @field_validator("object", mode="wrap")
     @classmethod
@@ -64,19 +71,19 @@ class CompareConfig(SweepConfig):
     def _of_stored_or_made(self) -> CompareConfig:
         """Refuse what says how pictures are made where stored ones are compared, and a single model."""
         if not self.object:
-            for asked in settings(type(self)):
-                if asked.field not in ALWAYS and getattr(self, asked.field) != asked.default:
+            for declared in settings.settings(type(self)):
+                if declared.field not in ALWAYS and getattr(self, declared.field) != declared.default:
                     raise InputError(
-                        f"{asked.name}: says how models are shown pictures, and no `object` is named; add `object`, or "
-                        "leave it out to compare stored sweeps"
+                        f"{declared.name}: says how models are shown pictures, and no `object` is named; add `object`, "
+                        "or leave it out to compare stored sweeps"
                     )
-        elif len(split_names(self.compared)) < 2:
+        elif len(settings.split_names(self.compared)) < 2:
             raise InputError(f"compared: expected at least two models, got {self.compared[:60]}; name another one")
         return self
 
     @property
     def title(self) -> tuple[str, ...]:
-        return "-".join(Path(name).stem for name in split_names(self.object or self.compared)), self.command
+        return "-".join(Path(name).stem for name in settings.split_names(self.object or self.compared)), self.command
 
     def sweep(self) -> SweepConfig:
         """Return the sweep of the models that has to be made first."""
@@ -93,7 +100,7 @@ class CompareConfig(SweepConfig):
     view=shown,
     claims=claims,
 )
-def compare(asked: RunContext[CompareConfig]) -> CompareResult:
+def compare(context: RunContext[CompareConfig]) -> CompareResult:
     """Compare models, objects or adversarial scenes on the same pictures, pair by pair (docs/compare.md).
 
     All other arguments are the settings of `advsearch compare`. The run is kept, in `run` or under runs/. Models that
@@ -104,73 +111,101 @@ def compare(asked: RunContext[CompareConfig]) -> CompareResult:
             `object`, names of models, which are shown it first.
     """
     # these import torch and pandas
-    from advsearch.experiment import run_part as carry_out_part
-    from advsearch.questions.compare.pairs import PairPictures, compared, differing, read_sides
-    from advsearch.rules import interval_of, share_of
-    from advsearch.runs.tables import count_wrong_outcomes
+    from advsearch.questions.compare.images import PairImages
+    from advsearch.questions.compare.pairs import compare_sides
+    from advsearch.questions.compare.sides import find_different_settings, read_sides
 
-    config, progress, renders = asked.config, asked.progress, 0
+    config = context.config
+    progress = context.progress
+    sides: list[Side] = []
+    n_renders = 0
     if config.object:
-        swept = asked.run.path / PARTS / "sweep"
-        done = carry_out_part(swept, config.sweep().with_only_here(config.only_here), progress)
-        renders = sum(getattr(done, "renders", {}).values())
-        sides = [] if done.goes_on else read_sides([swept])
+        result = context.run_part("sweep", config.sweep().with_only_here(config.only_here))
+        n_renders = sum(getattr(result, "renders", {}).values())
+        if not result.goes_on:
+            sides = read_sides([RunDirectory.locate_part(context.run.path, "sweep")])
     else:
         progress.stage("reading rows")
-        sides = read_sides([find_run(name) for name in split_names(config.compared)])
-    differ = differing(sides) if sides else []
-    pictures, pairs, warnings = PairPictures(asked), list[ComparedPair](), _cautions(sides, differ)
-    for number, other in enumerate(sides[1:], start=1):
+        sides = read_sides([find_run(name) for name in settings.split_names(config.compared)])
+    if not sides:
+        context.ending = results.INTERRUPTED
+    differ = find_different_settings(sides) if sides else []
+    warnings = find_cautions(sides, differ)
+
+    images = PairImages(context)
+    pairs: list[ComparedPair] = []
+    for number, side in enumerate(sides[1:], start=1):
         progress.stage("counting pairs")
         try:
-            pair = compared(sides[0], other, config.seed)
+            pair = compare_sides(sides[0], side, config.seed)
         except InputError as error:  # the library that finds rules is missing
             warnings.append(f"Where one side is worse was not looked for: {error}")
-            pair = compared(sides[0], other, config.seed, rules=False)
-        pairs.append(pair.model_copy(update={"shown": list(pictures.of(sides[0], other, number))}))
-    if not sides:
-        asked.ending = INTERRUPTED
-    return asked.result(
+            pair = compare_sides(sides[0], side, config.seed, with_rules=False)
+        examples = list(images.list_pairs(sides[0], side, number))
+        pairs.append(pair.model_copy(update={"shown": examples}))
+    return context.result(
         CompareResult,
-        environment=names_together(side.summary.environment for side in sides) or config.lit_by,
-        controls=sides[0].summary.controls if sides else list(config.controls),
-        object=names_together(side.named["object"] for side in sides) or config.object,
-        model=names_together(side.named["model"] for side in sides) or config.compared,
-        task=sides[0].summary.task if sides else config.task_name,
+        **describe_sweeps(config, sides),
         differ=differ,
-        sides=[
-            ComparedSide(
-                name=side.name,
-                run=str(side.folder),
-                **side.named,
-                configurations=len(side.rows),
-                correct=int(side.right.sum()),
-                accuracy=share_of(side.rows),
-                interval=interval_of(side.rows),
-                outcomes=count_wrong_outcomes(side.rows),
-                seconds=float(side.rows["seconds"].mean()),
-            )
-            for side in sides
-        ],
+        sides=[count_side(side) for side in sides],
         pairs=pairs,
-        renders=renders + pictures.rendered,
-        warnings=list(dict.fromkeys([*warnings, *pictures.warnings])),
+        renders=n_renders + images.n_rendered,
+        warnings=list(dict.fromkeys([*warnings, *images.warnings])),
     )
 
 
-def _cautions(sides: Sequence[Side], names: Sequence[str]) -> list[str]:
+def describe_sweeps(config: CompareConfig, sides: Sequence[Side]) -> dict[str, Any]:
+    """Return what the compared sweeps are of; without sides yet, from the settings."""
+    if not sides:
+        return {
+            "environment": config.lit_by,
+            "controls": list(config.controls),
+            "object": config.object,
+            "model": config.compared,
+            "task": config.task_name,
+        }
+    environments = settings.names_together(side.sweep.summary.environment for side in sides)
+    return {
+        "environment": environments or config.lit_by,
+        "controls": sides[0].sweep.summary.controls,
+        "object": settings.names_together(side.labels["object"] for side in sides) or config.object,
+        "model": settings.names_together(side.labels["model"] for side in sides) or config.compared,
+        "task": sides[0].sweep.summary.task,
+    }
+
+
+def count_side(side: Side) -> ComparedSide:
+    """Count how often the model is right with a side."""
+    from advsearch.extend import rules  # imports pandas
+
+    return ComparedSide(
+        name=side.name,
+        run=str(side.sweep.folder),
+        **side.labels,
+        configurations=len(side.rows),
+        correct=int(side.is_right.sum()),
+        accuracy=rules.share_of(side.rows),
+        interval=rules.interval_of(side.rows),
+        outcomes=rules.count_wrong_outcomes(side.rows),
+        seconds=float(side.rows["seconds"].mean()),
+    )
+
+
+def find_cautions(sides: Sequence[Side], differ: Sequence[str]) -> list[str]:
+    """Return what a reader has to know of sides whose sweeps differ in some settings."""
     if not sides:
         return []
-    cautions = [text for side in sides for text in side.summary.warnings]
-    if len(names) > 1:
-        listed = f"{', '.join(names[:-1])} and {names[-1]}"
-        cautions.append(f"The sweeps differ in {listed}: what is told here is of all of that together.")
-    if not names:
+    cautions = [text for side in sides for text in side.sweep.summary.warnings]
+    if len(differ) > 1:
+        names = f"{', '.join(differ[:-1])} and {differ[-1]}"
+        cautions.append(f"The sweeps differ in {names}: what is told here is of all of that together.")
+    if not differ:
         cautions.append("The sweeps have the same settings: what differs is in files, in versions, or in the machine.")
-    if len(sides[0].rows) > 1 and sides[0].rows["unit"].nunique() == 1:
-        name = sides[0].rows.attrs["unit name"]
-        cautions.append(f"All pairs are of one {name}: the shares are of this one, and nothing is shown of others.")
-    tasks = {side.summary.task for side in sides}
+    rows = sides[0].rows
+    if len(rows) > 1 and rows["unit"].nunique() == 1:
+        unit = rows.attrs["unit name"]
+        cautions.append(f"All pairs are of one {unit}: the shares are of this one, and nothing is shown of others.")
+    tasks = {side.sweep.summary.task for side in sides}
     if len(tasks) > 1:
         cautions.append(f"What counts as right is judged by different tasks: {', '.join(sorted(tasks))}.")
     return cautions

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
 
-from advsearch.questions.sweep.summary import AxisValue, CountedPredictions
-from advsearch.report import wording
-from advsearch.report.shown import Claim, Column, InNotebook, Picture, ResultPart, ShownResult, claim, counted
-from advsearch.report.wording import conditions_text, percent, share_of_text
-from advsearch.runs.results import ConditionRow, Fields, Interval, JsonFloat, RunResult
+from advsearch.extend import (
+    Claim,
+    Column,
+    Fields,
+    InNotebook,
+    Interval,
+    Picture,
+    ResultPart,
+    RunResult,
+    ShownResult,
+    results,
+    wording,
+)
 
 
-class ComparedSide(CountedPredictions):
+class ComparedSide(results.CountedPredictions):
     """One of the things that are compared, and how often the model is right with it."""
 
     name: str = Field(description="what tells it from the others")
@@ -23,7 +32,7 @@ class ComparedSide(CountedPredictions):
     object: str
     model: str
     answer: str = Field(default="", description="the run whose adversarial scene was swept; absent without")
-    seconds: JsonFloat = Field(
+    seconds: results.JsonFloat = Field(
         description="of a picture and its predictions, shared evenly among the models that saw it"
     )
 
@@ -38,6 +47,11 @@ class CountOf(Fields):
         default=None,
         description="of all; where pairs share draws, the mean over draws of the share of each; absent of older runs",
     )
+
+    @property
+    def text(self) -> str:
+        """The share with its interval and what it is of: ``12 % (9 to 16) of 340``."""
+        return wording.share_of_text(self.count, self.total, self.interval, self.share)
 
 
 class PairCounts(Fields):
@@ -73,7 +87,7 @@ class PairCounts(Fields):
 class PairRule(CountOf):
     """Values under which one side alone is right more often than elsewhere, counted on pairs that did not choose it."""
 
-    conditions: list[ConditionRow] = Field(description="all of which hold")
+    conditions: list[results.ConditionRow] = Field(description="all of which hold")
     elsewhere: CountOf = Field(description="pairs under no rule so far")
 
 
@@ -82,7 +96,7 @@ class PairPart(PairCounts):
 
     parameter: str
     unit: str
-    value: AxisValue
+    value: results.AxisValue
 
 
 class PairPicture(Fields):
@@ -132,7 +146,7 @@ class CompareResult(InNotebook, RunResult):
 
     @property
     def brief(self) -> str:
-        return ", ".join(f"{one.name} {one.accuracy:.1%}" for one in self.sides if one.accuracy is not None)
+        return ", ".join(f"{side.name} {side.accuracy:.1%}" for side in self.sides if side.accuracy is not None)
 
 
 LIKELY = (
@@ -147,41 +161,44 @@ NOTE_OF_UNITS = (
     "and intervals are over {units}, by bets, each for its row by itself. All {units} weigh the same."
 )
 
-LEVEL = 0.05  # A p-value up to this is called a difference
-MOST_TABLES, MOST_PICTURES = 4, 3
-"""Parameters, and pictures of what one side alone gets right, that a terminal shows; the page has all."""
+SIGNIFICANCE = 0.05  # A p-value up to this is called a difference
+MAX_TABLES = 4  # parameters that a terminal shows; the page has all
+MAX_PICTURES = 3  # of what one side alone gets right, likewise
 
 
 def shown(result: CompareResult) -> ShownResult:
-    def cost(one: ComparedSide) -> str:
-        if one.seconds != one.seconds:
-            return ""
-        return f"{1000.0 * one.seconds:.2g} ms" if one.seconds < 0.1 else wording.seconds_text(one.seconds)
-
-    columns: Mapping[str, Column] = {
+    """Return what is shown of a comparison."""
+    columns: dict[str, Column] = {
         "": "{0.name}",
         "right in": "{0.correct} of {0.configurations}",
-        "accuracy": lambda side: percent(side.accuracy),
+        "accuracy": lambda side: wording.percent(side.accuracy),
         "95 % interval": lambda side: wording.interval_text(side.interval),
-        "time a prediction": cost,
+        "time a prediction": lambda side: cost_text(side.seconds),
     }
     if any(side.outcomes for side in result.sides):
-        columns = {**columns, "the others": lambda side: wording.outcomes_text(side.outcomes, result.task)}
+        columns["the others"] = lambda side: wording.outcomes_text(side.outcomes, result.task)
     sections = [ResultPart.table(result.sides, columns, title="How often each is right")]
     for pair in result.pairs:
-        sections += _of_pair(pair, several=len(result.pairs) > 1)
+        sections += _pair_sections(pair, has_others=len(result.pairs) > 1)
     said = headline(result.pairs[0]) if result.pairs else "Interrupted before anything was compared."
-    sweeps = ", ".join(dict.fromkeys(one.run for one in result.sides))
+    sweeps = ", ".join(dict.fromkeys(side.run for side in result.sides))
     facts = {"sweeps": sweeps, "they differ in": ", ".join(result.differ)}
     return ShownResult(said, sections, facts, says_interrupted=not result.pairs)
 
 
+def cost_text(seconds: float) -> str:
+    """Return the time of a prediction; empty where it is not known."""
+    if math.isnan(seconds):
+        return ""
+    return f"{1000.0 * seconds:.2g} ms" if seconds < 0.1 else wording.seconds_text(seconds)
+
+
 def headline(pair: ComparedPair) -> str:
     """Return the first thing that a reader should know of two sides, in a sentence."""
-    before, after = map(percent, pair.accuracies)
+    first_accuracy, second_accuracy = map(wording.percent, pair.accuracies)
     of_units = "" if pair.units is None else f" of {wording.count(pair.units, pair.unit)}"
     return (
-        f"{pair.first} is right in {before} and {pair.second} in {after} of the same "
+        f"{pair.first} is right in {first_accuracy} and {pair.second} in {second_accuracy} of the same "
         f"{wording.count(pair.pairs, 'picture')}{of_units}: a difference of "
         f"{100.0 * pair.difference:+.1f} points "
         f"(95 % interval {points_text(pair.interval)})."
@@ -189,100 +206,121 @@ def headline(pair: ComparedPair) -> str:
 
 
 def points_text(interval: Interval) -> str:
-    return " to ".join(f"{100.0 * end:+.1f}" for end in interval)
+    """Return an interval of a difference in percentage points: ``-3.1 to +4.0``."""
+    return " to ".join(f"{100.0 * bound:+.1f}" for bound in interval)
 
 
 def alone_text(pair: ComparedPair) -> str:
     """Return what the pairs say that one side alone gets right, in a sentence."""
     if not pair.first_only and not pair.second_only:
         return "Both are right about the same pictures."
-    shown = "" if pair.p <= LEVEL else ". That there is a difference is not shown"
-    p = f"= {pair.p:.2g}" if pair.p >= 0.0001 else "< 0.0001"
+    reservation = "" if pair.p <= SIGNIFICANCE else ". That there is a difference is not shown"
+    p_text = f"= {pair.p:.2g}" if pair.p >= 0.0001 else "< 0.0001"
     test = "exact McNemar test" if pair.units is None else f"by {pair.unit}"
     return (
         f"{pair.first} alone is right in {pair.first_only} and {pair.second} alone in {pair.second_only} "
-        f"({test}, p {p}){shown}."
+        f"({test}, p {p_text}){reservation}."
     )
 
 
-def _of_pair(pair: ComparedPair, *, several: bool) -> Iterator[ResultPart]:
-    said = [headline(pair), alone_text(pair)] if several else [alone_text(pair)]
+def _pair_sections(pair: ComparedPair, *, has_others: bool) -> Iterator[ResultPart]:
+    sentences = [headline(pair), alone_text(pair)] if has_others else [alone_text(pair)]
     heads = ["", f"{pair.second} right", f"{pair.second} wrong"]
     rows = [
         [f"{pair.first} right", str(pair.both), str(pair.first_only)],
         [f"{pair.first} wrong", str(pair.second_only), str(pair.neither)],
     ]
     note = NOTE if pair.units is None else NOTE_OF_UNITS.format(units=f"{pair.unit}s")
-    yield ResultPart(f"{pair.first} and {pair.second}, pair by pair", said, heads, rows, note)
-    yield ResultPart("Where one is worse", [*_rules_texts(pair)])
+    yield ResultPart(f"{pair.first} and {pair.second}, pair by pair", sentences, heads, rows, note)
+    yield ResultPart("Where one is worse", [*_rule_texts(pair)])
+    yield from _parameter_tables(pair)
+    for name in (pair.first, pair.second):
+        yield from _pictures_of(name, pair)
+
+
+def _parameter_tables(pair: ComparedPair) -> Iterator[ResultPart]:
+    """Yield a table for each parameter; a terminal shows those over which the difference varies most."""
     tables: dict[str, list[PairPart]] = {}
     for part in pair.parts:
         unit = f", {part.unit}" if part.unit not in ("", "1", "name") else ""
         tables.setdefault(f"{part.parameter}{unit}", []).append(part)
-    spread = {name: np.ptp([one.difference for one in parts]) for name, parts in tables.items()}
-    told = sorted(tables, key=spread.__getitem__, reverse=True)[:MOST_TABLES]
+    range_of_difference = {name: np.ptp([part.difference for part in parts]) for name, parts in tables.items()}
+    by_range = sorted(tables, key=range_of_difference.__getitem__, reverse=True)
+    in_terminal = by_range[:MAX_TABLES]
     heads = ["", "pairs", pair.first, pair.second, "difference, points (95 % interval)"]
     heads += [f"{pair.first} alone", f"{pair.second} alone"]
     for name, parts in tables.items():
-        rows = []
-        for part in parts:
-            shares = [percent(accuracy) for accuracy in part.accuracies]
-            difference = f"{100.0 * part.difference:+.0f} ({points_text(part.interval)})"
-            alone = [str(part.first_only), str(part.second_only)]
-            rows.append([wording.value_text(part.value), str(part.pairs), *shares, difference, *alone])
-        yield ResultPart(name, heads=heads, rows=rows, only="" if name in told else "page")
-    if len(told) < len(tables):
+        rows = [_part_cells(part) for part in parts]
+        yield ResultPart(name, heads=heads, rows=rows, only="" if name in in_terminal else "page")
+    if len(in_terminal) < len(tables):
         more = f"The difference varies most over these; the page has all {len(tables)} parameters."
         yield ResultPart(text=[more], only="text")
-    for name in (pair.first, pair.second):
-        yield from _alone(name, pair)
 
 
-def _rules_texts(pair: ComparedPair) -> Iterator[str]:
-    ways = (
-        (pair.worse, pair.first_only, pair.first, pair.second),
-        (pair.better, pair.second_only, pair.second, pair.first),
-    )
-    for rules, alone_right, alone, other in ways:
-        where = f"Where {other} is worse than {alone}:"
-        if rules == [] and alone_right:
-            yield f"{where} no values stand out from chance."
-        for number, rule in enumerate(rules if rules and alone_right else ()):
-            rest = "elsewhere" if number == 0 else "in what no rule before covers"
-            inside, outside = (
-                share_of_text(one.count, one.total, one.interval, one.share) for one in (rule, rule.elsewhere)
-            )
-            yield f"{where} {conditions_text(rule.conditions)}, in {inside} pairs; {rest} in {outside}."
+def _part_cells(part: PairPart) -> list[str]:
+    accuracies = [wording.percent(accuracy) for accuracy in part.accuracies]
+    difference = f"{100.0 * part.difference:+.0f} ({points_text(part.interval)})"
+    alone = [str(part.first_only), str(part.second_only)]
+    return [wording.value_text(part.value), str(part.pairs), *accuracies, difference, *alone]
 
 
-def _alone(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
-    title, lines, missing, groups = f"Only {name} gets right:", list[list[str]](), list[str](), list[list[Picture]]()
-    for shown_pair in (shown_pair for shown_pair in pair.shown if shown_pair.right == name):
+def _rule_texts(pair: ComparedPair) -> Iterator[str]:
+    yield from _worse_texts(pair.worse, pair.first_only, pair.first, pair.second)
+    yield from _worse_texts(pair.better, pair.second_only, pair.second, pair.first)
+
+
+def _worse_texts(rules: Sequence[PairRule] | None, n_alone: int, name: str, other: str) -> Iterator[str]:
+    """Yield where the other side is worse than one that alone gets so many pairs right."""
+    if rules is None or not n_alone:
+        return
+    where = f"Where {other} is worse than {name}:"
+    if not rules:
+        yield f"{where} no values stand out from chance."
+    for index, rule in enumerate(rules):
+        rest = "elsewhere" if index == 0 else "in what no rule before covers"
+        conditions = wording.conditions_text(rule.conditions)
+        yield f"{where} {conditions}, in {rule.text} pairs; {rest} in {rule.elsewhere.text}."
+
+
+def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
+    """Yield the pictures of the pairs that one side alone gets right, for a terminal and for a page."""
+    title = f"Only {name} gets right:"
+    lines: list[list[str]] = []
+    without_pictures: list[str] = []
+    groups: list[list[Picture]] = []
+    for example in pair.shown:
+        if example.right != name:
+            continue
         values = ", ".join(
             f"{key} {value if isinstance(value, str) else format(value, '.3g')}"
-            for key, value in shown_pair.values.items()
+            for key, value in example.values.items()
         )
-        sides = zip((pair.first, pair.second), shown_pair.answers, strict=True)
-        captions = [f"{side}: {text}{' (right)' if side == name else ''}" for side, text in sides]
-        lines.append(["; ".join([*captions, values]), *shown_pair.pictures])
-        if not shown_pair.pictures:
-            missing.append(lines[-1][0])
+        answers = zip((pair.first, pair.second), example.answers, strict=True)
+        captions = [f"{side}: {answer}{' (right)' if side == name else ''}" for side, answer in answers]
+        line = "; ".join([*captions, values])
+        lines.append([line, *example.pictures])
+        if not example.pictures:
+            without_pictures.append(line)
             continue
-        captions = captions if len(shown_pair.pictures) == 2 else ["; ".join(captions)]
+        if len(example.pictures) != 2:
+            captions = ["; ".join(captions)]
         captions[0] += f"; {values}"
-        groups.append([Picture(*captioned) for captioned in zip(shown_pair.pictures, captions, strict=True)])
-    if all(len(group) == 1 for group in groups):
-        groups = [[picture for group in groups for picture in group]] if groups else []
-    yield ResultPart(title, rows=lines[:MOST_PICTURES], only="text")
-    yield ResultPart(title, missing, pictures=groups, only="page")
+        groups.append([Picture(file, caption) for file, caption in zip(example.pictures, captions, strict=True)])
+    if groups and all(len(group) == 1 for group in groups):
+        groups = [[picture for group in groups for picture in group]]
+    yield ResultPart(title, rows=lines[:MAX_PICTURES], only="text")
+    yield ResultPart(title, without_pictures, pictures=groups, only="page")
 
 
 def claims(result: CompareResult) -> Iterator[Claim]:
+    """Yield a claim for each pair."""
     for pair in result.pairs:
-        how = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
-        text = f"{headline(pair)} {alone_text(pair)} The interval of the difference is {how}."
+        method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
+        statement = f"{headline(pair)} {alone_text(pair)} The interval of the difference is {method}."
         side = next(side for side in result.sides if side.name == pair.second)
+        outcomes = wording.outcomes_text(side.outcomes, result.task)
+        if outcomes:
+            statement += f" Of the others {pair.second} has {outcomes}."
         what = f"configurations in which {pair.second} is right"
-        others = wording.outcomes_text(side.outcomes, result.task)
-        text += f" Of the others {pair.second} has {others}." if others else ""
-        yield claim("measured", text, counted(what, side.correct, side.configurations, side.interval, side.accuracy))
+        extent = results.Extent.of(what, side.correct, side.configurations, side.interval, side.accuracy)
+        yield Claim(kind="measured", statement=statement, extent=extent)

@@ -5,21 +5,30 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
-from advsearch.config import SceneConfig
-from advsearch.errors import InputError
-from advsearch.experiment import PositionalArgument, RunContext, experiment
+from advsearch.extend import (
+    Clash,
+    Config,
+    InputError,
+    PositionalArgument,
+    RunContext,
+    RunDirectory,
+    SceneConfig,
+    experiment,
+    find_run,
+    read_result,
+    results,
+    setting,
+    setting_as_in,
+    settings,
+)
 from advsearch.questions.explain.result import ExplainResult, RuleRow, claims, shown, triggering
-from advsearch.runs.directory import PARTS, find_run
-from advsearch.runs.results import INTERRUPTED
-from advsearch.runs.summary import read_result
-from advsearch.settings import Clash, Config, each_once, names_together, setting, setting_as_in, split_names, texts
 
 
 class ExplainConfig(Config):
     """Everything that decides what `explain` does: whose rows it reads, and what it renders to see whether it is so."""
 
     command: ClassVar[str] = "explain"
-    clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
+    clashes: ClassVar[tuple[Clash, ...]] = tuple(clash for clash in SceneConfig.clashes if clash.setting == "overwrite")
 
     # fmt: off
     sweeps: str = setting(
@@ -47,12 +56,12 @@ class ExplainConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-explain-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    _named = texts("run", several=["sweeps"])
-    _different = each_once("sweeps")
+    _named = settings.texts("run", several=["sweeps"])
+    _different = settings.each_once("sweeps")
 
     @property
     def title(self) -> tuple[str, ...]:
-        return Path(split_names(self.sweeps)[0]).name, self.command
+        return Path(settings.split_names(self.sweeps)[0]).name, self.command
 
 
 @experiment(
@@ -66,7 +75,7 @@ class ExplainConfig(Config):
     claims=claims,
     triggering=triggering,
 )
-def explain(asked: RunContext[ExplainConfig]) -> ExplainResult:
+def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
 
     Args:
@@ -74,63 +83,72 @@ def explain(asked: RunContext[ExplainConfig]) -> ExplainResult:
             recipe, its sweeps.
     """
     # these import torch, scipy and pandas
+    from advsearch.extend import rules, workbench
     from advsearch.questions.explain import findings
-    from advsearch.questions.explain.renders import AskedSweep, Renders, read_predictions
-    from advsearch.rules import FEWEST_ROWS, find_rules, halves, is_shown, observed
+    from advsearch.questions.explain.envelope import find_envelope
+    from advsearch.questions.explain.importance import find_importance
+    from advsearch.questions.explain.renders import Renders
+    from advsearch.questions.explain.rows import read_predictions
 
-    config, progress = asked.config, asked.progress
+    config = context.config
+    progress = context.progress
     progress.stage("reading rows")
-    sweeps = [AskedSweep.of(folder) for name in split_names(config.sweeps) for folder in _sweeps_of(find_run(name))]
+    folders = [folder for name in settings.split_names(config.sweeps) for folder in find_sweeps(find_run(name))]
+    sweeps = [workbench.StoredSweep.read(folder) for folder in folders]
     rows = read_predictions(sweeps)
-    rows = rows[is_shown(rows)].reset_index(drop=True)
-    if len(rows) < FEWEST_ROWS:
-        raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")
-    table = observed(rows, rows.attrs["units"])
+    rows = rows[rules.is_in_view(rows)].reset_index(drop=True)
+    if len(rows) < rules.FEWEST_ROWS:
+        raise InputError(
+            f"explain: expected at least {rules.FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations"
+        )
+    table = rules.observed(rows, rows.attrs["units"])
     if not table.attrs["units"]:
         raise InputError("explain: expected rows in which something varies that all of them have, got none")
-    choosing, counting = halves(table, config.seed)
+
+    choosing, counting = rules.halves(table, config.seed)
     progress.stage("seeking rules on one half of the rows")
-    found = find_rules(choosing, counting, config.seed)
+    found_rules = rules.find_rules(choosing, counting, config.seed)
     progress.stage("measuring which parameters matter")
-    importance = findings.find_importance(table)
-    box = findings.find_envelope(choosing, counting, config.accuracy)
-    renders = Renders(asked, sweeps, rows, table)
-    rules = [
-        RuleRow(**findings.rule_counts(one), confirmed=renders.confirmed(found.told, n))
-        for n, one in enumerate(found.told)
+    importance = find_importance(table)
+    envelope = find_envelope(choosing, counting, config.accuracy)
+
+    renders = Renders(context, sweeps, rows, table)
+    rule_rows = [
+        RuleRow(**findings.describe_rule(rule), confirmed=renders.confirm_rule(found_rules.told, index))
+        for index, rule in enumerate(found_rules.told)
     ]
-    pairs = list(renders.pairs(found.told))
-    clusters = renders.clusters()
+    pairs = list(renders.find_pairs(found_rules.told))
+    clusters = renders.find_clusters()
     if renders.interrupted:
-        asked.ending = INTERRUPTED
-    counted = findings.right_of(table)
-    return asked.result(
+        context.ending = results.INTERRUPTED
+    return context.result(
         ExplainResult,
         sweeps=[str(sweep.folder) for sweep in sweeps],
-        object=names_together(sweep.summary.object for sweep in sweeps),
-        model=names_together(sweep.summary.model for sweep in sweeps),
-        environment=names_together(sweep.summary.environment for sweep in sweeps),
+        object=settings.names_together(sweep.summary.object for sweep in sweeps),
+        model=settings.names_together(sweep.summary.model for sweep in sweeps),
+        environment=settings.names_together(sweep.summary.environment for sweep in sweeps),
         controls=sweeps[0].summary.controls,
         parameters=list(table.attrs["units"]),
-        **vars(counted),
+        **vars(findings.count_right(table)),
         units=None if table["unit"].is_unique else table["unit"].nunique(),
-        rules=rules,
-        not_told=findings.not_told(found.next, len(table)),
+        rules=rule_rows,
+        not_told=findings.describe_rejected(found_rules.next, len(table)),
         importance=importance,
-        envelope=box,
+        envelope=envelope,
         pairs=pairs,
         pairs_sought=renders.pairs_sought,
         clusters=clusters,
-        renders=renders.count,
-        warnings=[*renders.warnings, *findings.cautions(table, importance)],
+        renders=renders.n_renders,
+        warnings=[*renders.warnings, *findings.find_cautions(table, importance)],
     )
 
 
-def _sweeps_of(folder: Path) -> list[Path]:
-    made = read_result(folder)
-    if made.command != "recipe":
+def find_sweeps(folder: Path) -> list[Path]:
+    """Return the run directories of the sweeps of a run: itself, or parts of a recipe."""
+    result = read_result(folder)
+    if result.command != "recipe":
         return [folder]
-    parts = [folder / PARTS / part.name for part in getattr(made, "parts", ()) if part.command == "sweep"]
+    parts = [part for part in getattr(result, "parts", ()) if part.command == "sweep"]
     if not parts:
         raise InputError(f"explain: expected sweeps, got {folder}, a recipe without one")
-    return parts
+    return [RunDirectory.locate_part(folder, part.name) for part in parts]

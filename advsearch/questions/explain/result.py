@@ -7,20 +7,17 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.report import shown as showing
-from advsearch.report import wording
-from advsearch.report.shown import Claim, Column, Picture, ResultPart, ShownResult, claim, counted, share_text
-from advsearch.report.wording import conditions_text, interval_text, percent, share_of_text
-from advsearch.runs.results import (
-    ONLY_OF_BOXES,
-    WHAT_BECOMES,
-    ConditionRow,
+from advsearch.extend import (
+    Claim,
+    Column,
     Fields,
     Interval,
-    JsonFloat,
-    Outcomes,
+    Picture,
+    ResultPart,
     RunResult,
-    optional,
+    ShownResult,
+    results,
+    wording,
 )
 
 
@@ -34,15 +31,19 @@ class RightOf(Fields):
         default=None,
         description="right ones of all; where rows share draws, the mean over draws of the share of each",
     )
-    outcomes: Outcomes = optional(f"{WHAT_BECOMES} in the other ones; {ONLY_OF_BOXES}")
+    outcomes: results.Outcomes = results.optional(f"{results.WHAT_BECOMES} in the other ones; {results.ONLY_OF_BOXES}")
 
     @property
     def text(self) -> str:
         """A share with its interval and what it is of: ``12 % (9 to 16) of 340``; of a detector, what the others are:
         ``... of 340 (250 missed, 49 loose)``."""
-        share = share_of_text(self.right, self.total, self.interval, self.share)
+        share = wording.share_of_text(self.right, self.total, self.interval, self.share)
         outcomes = wording.outcomes_text(self.outcomes)
         return f"{share} ({outcomes})" if outcomes else share
+
+    def extent(self, what: str) -> results.Extent:
+        """Return the count for a claim; `what` says what is counted."""
+        return results.Extent.of(what, self.right, self.total, self.interval, self.share)
 
 
 class Confirmation(RightOf):
@@ -56,7 +57,7 @@ class Confirmation(RightOf):
 class RuleRow(RightOf):
     """A rule under which the model is wrong more often than elsewhere, counted on rows that did not choose it."""
 
-    conditions: list[ConditionRow] = Field(description="all of which hold")
+    conditions: list[results.ConditionRow] = Field(description="all of which hold")
     elsewhere: RightOf = Field(description="rows under no rule so far")
     confirmed: Confirmation | None = Field(
         description="fresh renders drawn inside the rule, and `held`, whether they tell it again; null where none were "
@@ -67,7 +68,7 @@ class RuleRow(RightOf):
 class RuleNotTold(RightOf):
     """The best rule that is not told from chance, counted on rows that did not choose it."""
 
-    conditions: list[ConditionRow] = Field(description="all of which hold")
+    conditions: list[results.ConditionRow] = Field(description="all of which hold")
     elsewhere: RightOf = Field(description="rows under no rule so far")
     chance: float = Field(description="how likely so few right predictions are by chance")
     asked: float = Field(description="how unlikely they would have to be")
@@ -78,7 +79,9 @@ class ParameterWeight(Fields):
     """What one parameter, or two together, decide of the prediction."""
 
     parameters: list[str]
-    share: JsonFloat = Field(description="of the variance of the predictions, by which of its parts a value lies in")
+    share: results.JsonFloat = Field(
+        description="of the variance of the predictions, by which of its parts a value lies in"
+    )
     interval: Interval = Field(description="of the share, 95 %")
     parts: int = Field(default=0, description="into how many its values were cut, of two all pairs of parts")
 
@@ -86,7 +89,9 @@ class ParameterWeight(Fields):
 class EnvelopeRow(RightOf):
     """A box inside which the model is right at least so often."""
 
-    conditions: list[ConditionRow] = Field(description="all of which hold; empty for everything that was looked at")
+    conditions: list[results.ConditionRow] = Field(
+        description="all of which hold; empty for everything that was looked at"
+    )
     accuracy: float = Field(description="what was asked for")
     held: bool = Field(description="whether the rows that did not choose the box show it")
 
@@ -179,8 +184,8 @@ def shown(result: ExplainResult) -> ShownResult:
     rules = [f"{number}. {rule_text(number, rule)}" for number, rule in enumerate(result.rules, start=1)]
     weights: Mapping[str, Column] = {
         "parameters": lambda one: " with ".join(one.parameters),
-        "decides": lambda one: percent(one.share),
-        "95 % interval": lambda one: interval_text(one.interval),
+        "decides": lambda one: wording.percent(one.share),
+        "95 % interval": lambda one: wording.interval_text(one.interval),
         "by parts": lambda one: str(one.parts or ""),
     }
     sections = [
@@ -209,8 +214,9 @@ def shown(result: ExplainResult) -> ShownResult:
 
 
 def rule_text(number: int, rule: RuleRow) -> str:
+    """Return the rule with this number, from 1, in a sentence, with its counts and its confirmation."""
     rest = "elsewhere" if number == 1 else "in what no rule before covers"
-    text = f"{conditions_text(rule.conditions)}: right in {rule.text}; {rest} {rule.elsewhere.text}."
+    text = f"{wording.conditions_text(rule.conditions)}: right in {rule.text}; {rest} {rule.elsewhere.text}."
     if rule.confirmed is None:
         return text
     verdict = "confirmed" if rule.confirmed.held else "not confirmed"
@@ -233,8 +239,8 @@ def not_told_text(result: ExplainResult) -> str:
         return ""
     text = (
         f"Not told{' either' if result.rules else ''}, but the best that one half of the rows suggests: "
-        f"{conditions_text(rule.conditions)}. In the other half the model is right in {rule.right} of {rule.total} "
-        f"under it and in {rule.elsewhere.right} of {rule.elsewhere.total} elsewhere"
+        f"{wording.conditions_text(rule.conditions)}. In the other half the model is right in {rule.right} of "
+        f"{rule.total} under it and in {rule.elsewhere.right} of {rule.elsewhere.total} elsewhere"
     )
     if rule.rows is None:
         return f"{text}, which is no difference that more rows would tell."
@@ -243,10 +249,11 @@ def not_told_text(result: ExplainResult) -> str:
 
 
 def envelope_text(result: ExplainResult) -> str:
+    """Return in a sentence where the model can be relied on."""
     box = result.envelope
     if box is None:
         return "No box of enough rows promises the accuracy that was asked for."
-    where = conditions_text(box.conditions)
+    where = wording.conditions_text(box.conditions)
     if not box.held:
         return f"Not shown: inside {where} the rows that did not choose it are right in {box.text}."
     return f"At least {100 * box.accuracy:g} % at 95 % confidence: {where}; right in {box.text}."
@@ -278,17 +285,23 @@ def _kinds(found: FailureClusters) -> ResultPart:
 
 
 def claims(result: ExplainResult) -> Iterator[Claim]:
+    """Yield the claims that the rules and the envelope support."""
     for number, rule in enumerate(result.rules, 1):
-        how = "fresh renders" if rule.confirmed else "rows that did not choose the rule"
-        of = rule.confirmed or rule
-        extent = counted(f"right, of {how}", of.right, of.total, of.interval, of.share)
-        text = f"Where {conditions_text(rule.conditions)} (rule {number}) the model is right in {share_text(extent)}"
-        yield claim("measured", f"{text} {how}; elsewhere in {rule.elsewhere.text}.", extent)
+        counts: RightOf = rule.confirmed or rule
+        source = "fresh renders" if rule.confirmed else "rows that did not choose the rule"
+        extent = counts.extent(f"right, of {source}")
+        where = f"{wording.conditions_text(rule.conditions)} (rule {number})"
+        inside = f"{wording.share_text(extent)} {source}"
+        statement = f"Where {where} the model is right in {inside}; elsewhere in {rule.elsewhere.text}."
+        yield Claim(kind="measured", statement=statement, extent=extent)
     box = result.envelope
     if box is not None and box.held and box.total:
-        extent = counted("right, of rows that did not choose the box", box.right, box.total, box.interval, box.share)
-        text = f"Inside {conditions_text(box.conditions)} the model is right in {share_text(extent)} configurations"
-        yield claim("measured", f"{text} that did not choose this box; the sweeps drew no others.", extent)
+        extent = box.extent("right, of rows that did not choose the box")
+        where = wording.conditions_text(box.conditions)
+        inside = f"{wording.share_text(extent)} configurations that did not choose this box"
+        statement = f"Inside {where} the model is right in {inside}; the sweeps drew no others."
+        yield Claim(kind="measured", statement=statement, extent=extent)
     elif not result.rules:
-        why = "no box of values was shown to keep the accuracy that was asked for"
-        yield showing.nothing_claimed(why, envelope_text(result))
+        reason = "no box of values was shown to keep the accuracy that was asked for"
+        statement = f"Nothing is claimed: {reason}. {envelope_text(result)}"
+        yield Claim(kind="nothing claimed", statement=statement, extent=None)

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.experiment import RunContext, experiment
-from advsearch.questions.attack.settings import AttackConfig
+from advsearch.extend import AttackConfig, RunContext, experiment
 from advsearch.questions.region.result import RegionConfig, RegionResult, claims, shown
 
 
-def of_the_run(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
+def read_shared_settings(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the run around whose adversarial configuration a box grows brings: scene, model and controls."""
     return RegionConfig.shared(AttackConfig.from_yaml(file))
 
@@ -21,12 +20,12 @@ def of_the_run(file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:
     "region --around mug-pose-001 --vary pose.yaw,pose.pitch",
     positional_args=("object", "model"),
     about="around",
-    defaults_from_run=of_the_run,
+    defaults_from_run=read_shared_settings,
     view=shown,
     claims=claims,
 )
-def region(asked: RunContext[RegionConfig]) -> RegionResult:
+def region(context: RunContext[RegionConfig]) -> RegionResult:
     """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md)."""
-    from advsearch.questions.region.growing import region_around  # imports torch
+    from advsearch.questions.region.growing import find_region  # imports torch
 
-    return region_around(asked)
+    return find_region(context)

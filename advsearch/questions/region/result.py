@@ -7,17 +7,25 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.config import DerivativeConfig, SceneConfig
-from advsearch.questions.attack.settings import AttackConfig
-from advsearch.report.shown import Claim, Column, InNotebook, ResultPart, ShownResult, claim, counted, share_text
-from advsearch.report.wording import percent
-from advsearch.runs import results
-from advsearch.runs.results import Fields, Interval, JsonFloat, SceneResult
-from advsearch.settings import setting, setting_as_in
+from advsearch.extend import (
+    AttackConfig,
+    Claim,
+    Column,
+    Fields,
+    InNotebook,
+    Interval,
+    ResultPart,
+    SceneConfig,
+    ShownResult,
+    results,
+    setting,
+    setting_as_in,
+    wording,
+)
 
 FEWEST_SAMPLES = 8
 """With fewer, not even a box without exceptions has one verdict in more than half of it, at the confidence of
-`questions.region.growing.GrownBox.interval`."""
+`questions.region.boxes.GrownBox.interval`."""
 
 
 class RegionConfig(SceneConfig):
@@ -44,7 +52,7 @@ class RegionConfig(SceneConfig):
         ge=0, le=512,
     )
     specialise: bool = setting_as_in(
-        DerivativeConfig, "specialise", group="region",
+        AttackConfig, "specialise", group="region",
         description="predict pictures from new viewpoints while the box grows, and those of the map",
         switched="render every picture",
     )
@@ -71,7 +79,9 @@ class MarginMap(Fields):
     """The margin on a grid over two parameters."""
 
     axes: tuple[AxisRange, AxisRange]
-    margins: list[list[JsonFloat]] = Field(description="logits, in rows of the second parameter from its lowest value")
+    margins: list[list[results.JsonFloat]] = Field(
+        description="logits, in rows of the second parameter from its lowest value"
+    )
 
 
 class GrownRegion(Fields):
@@ -90,7 +100,7 @@ class GrownRegion(Fields):
     )
 
 
-class RegionResult(InNotebook, GrownRegion, SceneResult):
+class RegionResult(InNotebook, GrownRegion, results.SceneResult):
     """The box around a configuration in which the verdict stays."""
 
     command: ClassVar[str] = "region"
@@ -111,6 +121,7 @@ class RegionResult(InNotebook, GrownRegion, SceneResult):
 
 
 def shown(result: RegionResult) -> ShownResult:
+    """Return what is shown of a region."""
     if result.box is None or result.interval is None:
         return ShownResult("Stopped before the box was known.")
     box: Mapping[str, Column] = {
@@ -122,18 +133,23 @@ def shown(result: RegionResult) -> ShownResult:
     }
     return ShownResult(
         f"The model is {result.verdict} in {result.same} of {result.samples} fresh samples of this box: with 95 % "
-        f"confidence in at least {percent(result.interval[0])} of it.",
+        f"confidence in at least {wording.percent(result.interval[0])} of it.",
         [ResultPart.table(result.box, box, title="The box")],
-        {"share of the space": percent(result.volume), "samples a pixel": str(result.spp or "")},
+        {"share of the space": wording.percent(result.volume), "samples a pixel": str(result.spp or "")},
     )
 
 
 def claims(result: RegionResult) -> Iterator[Claim]:
+    """Yield the claim about the box, if it is known."""
     if not result.samples or result.same is None or result.interval is None or result.verdict is None:
         return
-    extent = counted(f"samples that are {result.verdict}", result.same, result.samples, result.interval)
-    box = ", ".join(f"{side.name} {side.low:.4g} to {side.high:.4g} {side.unit}".strip() for side in result.box or ())
-    text = (
-        f"Inside {box or 'the box'} the model is {result.verdict} in {share_text(extent)} samples drawn evenly from it."
+    what = f"samples that are {result.verdict}"
+    extent = results.Extent.of(what, result.same, result.samples, result.interval)
+    sides = [f"{side.name} {side.low:.4g} to {side.high:.4g} {side.unit}".strip() for side in result.box or ()]
+    box = ", ".join(sides) or "the box"
+    inside = f"{wording.share_text(extent)} samples drawn evenly from it"
+    statement = (
+        f"Inside {box} the model is {result.verdict} in {inside}. Certified by sampling: single points of it may "
+        "differ."
     )
-    yield claim("measured", f"{text} Certified by sampling: single points of it may differ.", extent)
+    yield Claim(kind="measured", statement=statement, extent=extent)

@@ -29,13 +29,13 @@ from advsearch.questions.report.recorded import (
     sweeps_read,
 )
 from advsearch.questions.report.result import ConditionShare, Evidence, EvidenceRun
-from advsearch.questions.sweep.summary import AxisValue, SweepSummary
+from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.registry import get_experiment
 from advsearch.report import wording
 from advsearch.report.shown import Claim, claim, counted, nothing_claimed, share_text, shown
 from advsearch.report.wording import interval_text, number_text, percent
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, PHOTOGRAPHS, find_run, is_run, typed_name
-from advsearch.runs.results import RUNNING, Interval, Result, VariedValue
+from advsearch.runs.results import RUNNING, AxisValue, Interval, Result, VariedValue
 from advsearch.runs.store import Row, Store
 from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.runs.summary import read_result

@@ -20,7 +20,6 @@ from advsearch.options import Outcome
 from advsearch.questions.sweep.settings import BLIND, HARMLESS
 from advsearch.questions.sweep.summary import (
     AxisRow,
-    CountedPredictions,
     DriveRates,
     OverDrives,
     SurfaceMap,
@@ -32,7 +31,7 @@ from advsearch.report import wording
 from advsearch.report.figures import ACCURACY, BLUE, GREY, MARGIN, MOST_POINTS, Figures, axis_title, figure_of, heat
 from advsearch.report.shown import Claim, Column, Extent, ResultPart, ShownResult, claim, counted, extent_of, share_text
 from advsearch.report.wording import beside_text, count, margin_text, percent, prediction_text, short_name
-from advsearch.runs.results import INTERRUPTED
+from advsearch.runs.results import INTERRUPTED, CountedPredictions
 from advsearch.settings import split_names
 from advsearch.statistics.monotone import Dip, _fit_falling, find_dips
 

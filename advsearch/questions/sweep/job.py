@@ -23,6 +23,7 @@ from advsearch.engine.record import rate_of
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.models.features import Features, features_of
 from advsearch.options import Value
 from advsearch.progress import Stages
 from advsearch.questions.sweep.axes import Axis, Drawn, Points, on_grid
@@ -346,6 +347,16 @@ class OpenScenes:
         """The picture (H, W, 3) as the first model sees it."""
         scene, (query, *_) = self.asked(number)
         return scene.picture(query)
+
+    def thumbnail(self, number: int) -> bytes:
+        """The same as a small JPEG."""
+        return thumbnails.thumbnail(self.picture(number))
+
+    def find_features(self) -> Features:
+        """Find what reads the features that the first model decides by. Raises InputError: the task has none."""
+        if self.job.tasks[0].varies:
+            raise InputError(f"task {self.job.config.task_name}: features are read of classifiers")
+        return features_of(self.job.models[0])
 
 
 def check_worst(

@@ -18,12 +18,14 @@ from advsearch.attacks import Query
 from advsearch.attacks.domain import Product
 from advsearch.engine.acceptance import CHECK_SPP, VIEWS, ComparedView, Deviation, compared, view_of
 from advsearch.engine.problem import Problem
+from advsearch.engine.surface_light import LIGHTS, SurfaceLight
+from advsearch.engine.verifier import Verifier
 from advsearch.questions.sweep.axes import Axis, Points
 from advsearch.runs.results import LinearTransport, PredictionError
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.color import to_8_bit
 from advsearch.scene.mitsuba_backend.surface import RAYS
-from advsearch.scene.predictor import MOST_BYTES, NOISE, NOTHING_MOVES, Predictor, Refusal
+from advsearch.scene.predictor import MOST_BYTES, NOISE, NOTHING_MOVES, Predictor, Refusal, RefusalCause
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.surface.arrangement import CAMERAS, COLOR, FREE, MAP
 from advsearch.scene.surface.renderer import SurfaceRenderer, varied, why_not_kept
@@ -324,3 +326,42 @@ def combined(found: Sequence[LinearTransport | None]) -> LinearTransport | None:
         "error": max((one.error for one in used if one.error), key=lambda error: error.levels or 0.0, default=None),
     }
     return used[0].model_copy(update=worst)
+
+
+def prepare_surface_light(verifier: Verifier, at: Tensor, coordinates: Tensor, n_images: int) -> None:
+    """Find the light on surfaces around a configuration, if it predicts trials there more cheaply than renders.
+
+    The verifier's findings then have it as `transport`, or state why images are rendered where cameras move.
+
+    Args:
+        verifier: of the trials, whose sample count is known.
+        at: the configuration (d,).
+        coordinates: of the numbers that vary (k,).
+        n_images: trials, about.
+    """
+    problem = verifier.problem
+    varying = set(coordinates.tolist())
+    groups = [
+        group.name
+        for group in problem.space.groups
+        if not varying.isdisjoint(range(group.begin, group.begin + group.size))
+    ]
+    changed_inputs = varied(problem.renderer, groups)
+    if not changed_inputs & CAMERAS or not changed_inputs <= FREE:
+        return
+    findings = verifier.findings
+    findings.rendered_because = why_not_kept(problem.renderer)
+    min_images = pays_from(problem.renderer, findings.spp)
+    if findings.rendered_because is None and n_images < min_images:
+        reason = f"light on surfaces pays from {min_images} pictures on"
+        findings.rendered_because = Refusal(reason, RefusalCause.TOO_FEW_STEPS)
+    if findings.rendered_because is not None:
+        return
+    title = "finding the light on surfaces"
+    verifier.stages.begin("transport", title, LIGHTS, hint="`specialise=false` leaves it out")
+    light = SurfaceLight(problem, 0, at=at, places=coordinates)
+    light.prepare(verifier.stages.progress.advance)
+    findings.transport = light
+    findings.rendered_because = light.too_far_off
+    if findings.rendered_because is not None:
+        findings.transport = None

@@ -21,12 +21,13 @@ from advsearch.pictures import LARGEST_FILE, check_pixels, opened
 from advsearch.questions.sweep.display import sweep_axes, sweep_figure
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.page import write_sweep_page
-from advsearch.questions.sweep.summary import AxisRow, CountedPredictions, MapAxis, PairedRates, SweepMap, SweepSummary
+from advsearch.questions.sweep.summary import AxisRow, MapAxis, PairedRates, SweepMap, SweepSummary
 from advsearch.report.figures import new_axes
 from advsearch.report.shown import result_html, shown
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory, default_name
 from advsearch.runs.export import read_threedb
+from advsearch.runs.results import CountedPredictions
 from advsearch.runs.tables import Units, read_sweep, to_pandas
 from advsearch.statistics.clustered import mean_share, paired_by_unit, per_unit, share_interval
 from advsearch.statistics.intervals import clopper_pearson

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import field_validator
 
 from advsearch.config import ControlsByName, DerivativeConfig, RenderConfig, SceneConfig
 from advsearch.files import MESHES, either
+from advsearch.options import BY_KEY
 from advsearch.questions.attack.settings import FEWEST_TRIALS, AttackConfig
 from advsearch.settings import Clash, each_once, number_or_text, setting, setting_as_in, split_names
+
+if TYPE_CHECKING:
+    from advsearch.controls import Control, Parameter
 
 BLIND = {
     "black": "the picture is black",
@@ -163,6 +167,23 @@ class SweepConfig(SceneConfig):
     @property
     def environments(self) -> tuple[str, ...]:
         return split_names(self.lit_by)
+
+    def find_control_type(self, instance: str) -> type[Control] | None:
+        """Return the class of a control by its instance's name; None where no control has it."""
+        from advsearch.controls import CONTROLS  # imports torch
+
+        kind = str(self.controls.get(instance, {}).get("kind", instance))
+        if kind not in CONTROLS:
+            kind = kind.partition(":")[0]
+        return CONTROLS.get(kind)
+
+    def declared_parameters(self, instance: str) -> dict[str, Parameter] | None:
+        """Return the parameters that a control declares, by name; None where the scene declares them."""
+        control_type = self.find_control_type(instance)
+        if control_type is None or control_type.kind == BY_KEY:
+            return None
+        declared = control_type.declared(self.controls.get(instance, {}))
+        return {parameter.name: parameter for parameter in declared}
 
     @classmethod
     def of_attack(cls, file: Path, typed: Mapping[str, Any]) -> dict[str, Any]:

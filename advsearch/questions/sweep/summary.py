@@ -8,6 +8,8 @@ from pydantic import Field
 
 from advsearch.runs import results
 from advsearch.runs.results import (
+    AxisValue,
+    CountedPredictions,
     Fields,
     Interval,
     JsonFloat,
@@ -18,21 +20,6 @@ from advsearch.runs.results import (
     having,
     optional,
 )
-
-AxisValue = int | float | str | tuple[float, float]  # a number, a name, or both ends of a part of a range
-
-
-class CountedPredictions(Fields):
-    """Configurations, and in how many of them the model is right."""
-
-    configurations: int = Field(description="how many were looked at")
-    correct: int = Field(description="right predictions")
-    accuracy: float | None = Field(
-        description="their share; where some share a [draw](drives.md), the mean over draws of the share of each; null "
-        "where there is no configuration"
-    )
-    interval: Interval | None = Field(description="of that share, 95 %; null where all are of one draw")
-    outcomes: results.Outcomes = results.optional(f"{results.WHAT_BECOMES} in the other ones; {results.ONLY_OF_BOXES}")
 
 
 class AxisRow(CountedPredictions):

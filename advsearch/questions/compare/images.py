@@ -1,0 +1,101 @@
+"""Small images of pairs that one side alone gets right."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from advsearch.extend import InputError, ModelError, RunContext
+from advsearch.questions.compare.result import PairPicture
+from advsearch.questions.compare.sides import Side
+
+
+class MissingImage(NamedTuple):
+    """An image to render: of a side, with a number; and the name of its file in the run directory."""
+
+    side: Side
+    number: int
+    file: str
+
+
+@dataclass
+class PairImages:
+    """Images of pairs in the directory of the run: those that sweeps have stored, or rendered again.
+
+    Attributes:
+        context: of the experiment.
+        n_rendered: images that were rendered.
+        warnings: sentences about images that could not be rendered.
+    """
+
+    context: RunContext[Any]
+    n_rendered: int = 0
+    warnings: list[str] = field(default_factory=list)
+    _unavailable: set[str] = field(default_factory=set)
+
+    def list_pairs(self, first: Side, second: Side, pair: int) -> Iterator[PairPicture]:
+        """Yield pairs that one side alone gets right, where the margins are farthest apart first.
+
+        There are at most as many of each side as the settings say, with images as far as these are available; `pair` is
+        the number of the two sides.
+        """
+        run = self.context.run
+        margin_gap = (first.rows["margin"] - second.rows["margin"]).fillna(0.0)
+        rows = [
+            *find_smallest(-margin_gap[first.is_right & ~second.is_right], self.context.config.pictures),
+            *find_smallest(margin_gap[~first.is_right & second.is_right], self.context.config.pictures),
+        ]
+        shares_images = first.sweep.folder == second.sweep.folder and first.rows["number"].equals(second.rows["number"])
+        sides = {"a": first} if shares_images else {"a": first, "b": second}
+        files = {row: [f"images/pair-{pair}-{row}-{letter}.jpg" for letter in sides] for row in rows}
+        missing = []
+        with self.context.until_interrupted():
+            for row in rows:
+                for side, file in zip(sides.values(), files[row], strict=True):
+                    number = int(side.rows["number"][row])
+                    stored = side.sweep.find_thumbnail(number)
+                    if stored is not None:
+                        run.write_file(file, stored.read_bytes())
+                    elif not (run.path / file).is_file():
+                        missing.append(MissingImage(side, number, file))
+            self._render(missing)
+        for row in rows:
+            values = first.rows.loc[row, first.varying_parameters].items()
+            is_complete = all((run.path / file).is_file() for file in files[row])
+            yield PairPicture(
+                number=row,
+                values={name: value if isinstance(value, str) else float(f"{value:.6g}") for name, value in values},
+                right=(first if first.is_right[row] else second).name,
+                answers=(first.rows["label"][row], second.rows["label"][row]),
+                pictures=files[row] if is_complete else [],
+            )
+
+    def _render(self, missing: Sequence[MissingImage]) -> None:
+        """Render images again, those of one sweep after the other, so that its scenes are loaded once."""
+        if missing:
+            self.context.progress.stage("rendering pictures again", len(missing), hint="`pictures` says how many")
+        for image in sorted(missing, key=lambda image: (str(image.side.sweep.folder), image.number)):
+            self._render_image(image)
+            self.context.progress.advance(1)
+
+    def _render_image(self, image: MissingImage) -> None:
+        sweep = image.side.sweep
+        if str(sweep.folder) in self._unavailable:
+            return
+        try:
+            scenes = sweep.scenes
+        except (InputError, ModelError) as error:  # a scene or a model is no longer available
+            self._unavailable.add(str(sweep.folder))
+            self.warnings.append(f"Pictures of {sweep.folder.name} are not shown: {error}")
+            return
+        self.context.run.write_file(image.file, scenes.thumbnail(image.number))
+        self.n_rendered += 1
+
+
+def find_smallest(values: pd.Series, limit: int) -> list[int]:
+    """Return the indices of the smallest values, in rising order."""
+    indices: list[int] = values.sort_values(kind="stable").index[:limit].tolist()
+    return indices

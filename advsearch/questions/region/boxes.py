@@ -1,0 +1,174 @@
+"""Boxes that grow around a point while a property stays the same, and what samples show of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from advsearch.extend import InputError, seeds, statistics
+
+LEVELS = 6  # How often the step of the faces is halved
+ATTEMPTS = 4  # Final checks at most
+PROBES = 8  # Random points at which what a face would win is probed
+USUAL_PROBED = 100  # Images of growing for each parameter, usually
+MAX_PROBED = 400
+"""Images of growing for each parameter: that is more than twice what boxes, balls, planes and noise have taken."""
+MIN_STEP = 1e-3  # A face does not move by less
+PULLED_IN = 0.98  # Share of the distance between the centre and an exception at which a face lies that excludes it
+
+IsSame = Callable[[Tensor, int], bool]
+"""(u, number) -> whether the prediction at u is that of the centre; number numbers its seed."""
+
+
+@dataclass(frozen=True, eq=False)
+class GrownBox:
+    """A box in the unit box in which the prediction stays the same.
+
+    Attributes:
+        center: the point that it grew around (d,).
+        low, high: its corners (d,).
+        same: how many of the final samples had the centre's prediction.
+        samples: the final samples.
+        renders: images in all.
+    """
+
+    center: Tensor
+    low: Tensor
+    high: Tensor
+    same: int
+    samples: int
+    renders: int
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The 95 % interval of the share of the box with the centre's prediction.
+
+        It holds for all `ATTEMPTS` together, since the last box is the one that passed (Bonferroni).
+        """
+        return statistics.intervals.clopper_pearson(self.same, self.samples, 1.0 - 0.05 / ATTEMPTS)
+
+    @property
+    def volume(self) -> float:
+        return float((self.high - self.low).prod())
+
+
+def grow(
+    is_same: IsSame, center: Tensor, *, seed: int, samples: int = 200, on_check: Callable[[], None] = lambda: None
+) -> GrownBox:
+    """Grow a box around a point, then check it with samples that nothing was fitted to.
+
+    Each face in turn tries to move out by a share of what is left to the bound (1/2 at first, halved at every level at
+    which no face can move any more). The slab that it would win is probed at random points; if all have the centre's
+    prediction, it moves. Growing ends after `MAX_PROBED` images for each parameter at the latest. Then the box is
+    sampled; on an exception, the face that cuts off the least of the box moves in to it and the box is sampled anew,
+    with other seeds, `ATTEMPTS` times at most; the last check counts whatever it shows.
+
+    Args:
+        is_same: whether a point has the prediction of the centre.
+        center: in [0, 1] (d,).
+        seed: of the random points.
+        samples: of each check.
+        on_check: called at the beginning of each check.
+
+    Raises:
+        InputError: there are no samples, or the centre lies outside the unit box.
+    """
+    if samples < 1:
+        raise InputError(f"samples: expected at least 1, got {samples}")
+    if not bool(((center >= 0.0) & (center <= 1.0)).all()):
+        raise InputError("the centre of a region has to lie inside the ranges of its parameters")
+    box = GrowingBox(is_same, center, seed)
+    box.grow()
+    n_exceptions = 0
+    for attempt in range(ATTEMPTS):
+        on_check()
+        exceptions = box.sample_exceptions(samples)
+        n_exceptions = len(exceptions)
+        if n_exceptions == 0 or attempt == ATTEMPTS - 1:
+            break
+        for point in exceptions:
+            box.exclude(point)
+    return GrownBox(center, box.low, box.high, samples - n_exceptions, samples, box.n_evaluated)
+
+
+class GrowingBox:
+    """A box around a point whose faces move.
+
+    Attributes:
+        low, high: its corners (d,).
+        n_evaluated: points whose prediction was asked for.
+    """
+
+    def __init__(self, is_same: IsSame, center: Tensor, seed: int) -> None:
+        self._is_same = is_same
+        self._center = center
+        self._seed = seed
+        self._n_draws = 0
+        self.low = center.clone()
+        self.high = center.clone()
+        self.n_evaluated = 0
+
+    def grow(self) -> None:
+        """Move faces out while the slabs that they win have the centre's prediction."""
+        n_faces = 2 * len(self._center)
+        # so many that a round of all faces still fits
+        last_round = MAX_PROBED * len(self._center) - n_faces * PROBES
+        share = 0.5
+        for _ in range(LEVELS):
+            has_moved = True
+            while has_moved and self.n_evaluated <= last_round:
+                moves = [self._push(face, share) for face in range(n_faces)]
+                has_moved = any(moves)
+            share /= 2.0
+
+    def sample_exceptions(self, count: int) -> Tensor:
+        """Sample points of the box, and return those (n, d) that have another prediction than the centre."""
+        points = self._sample(self.low, self.high, count)
+        return points[[not self._evaluate(point) for point in points]]
+
+    def exclude(self, point: Tensor) -> None:
+        """Move the face in that takes the least of the box away, so that a point lies outside."""
+        if not bool(((point >= self.low) & (point <= self.high)).all()):
+            return
+        width = (self.high - self.low).clamp_min(1e-12)
+        loss = torch.where(point > self._center, (self.high - point) / width, (point - self.low) / width)
+        axis = int(torch.where(point == self._center, torch.inf, loss).argmin())  # the centre stays inside
+        face = self.high if point[axis] > self._center[axis] else self.low
+        face[axis] = torch.lerp(self._center[axis], point[axis], PULLED_IN)
+
+    def _push(self, face: int, share: float) -> bool:
+        """Move a face out if the slab that it wins has the centre's prediction; return whether it moved."""
+        axis, is_upper = divmod(face, 2)
+        room = float(1.0 - self.high[axis] if is_upper else self.low[axis])
+        step = room if room < 4.0 * MIN_STEP else share * room
+        if room <= 0.0 or (step < MIN_STEP and step != room):
+            return False
+        slab_low = self.low.clone()
+        slab_high = self.high.clone()
+        if is_upper:
+            slab_low[axis] = self.high[axis]
+            slab_high[axis] = self.high[axis] + step
+            outer = slab_high[axis]
+        else:
+            slab_low[axis] = self.low[axis] - step
+            slab_high[axis] = self.low[axis]
+            outer = slab_low[axis]
+        probes = self._sample(slab_low, slab_high, PROBES)
+        probes[0, axis] = outer
+        if not all(self._evaluate(point) for point in probes):
+            return False
+        (self.high if is_upper else self.low)[axis] = outer.clamp(0.0, 1.0)
+        return True
+
+    def _evaluate(self, u: Tensor) -> bool:
+        self.n_evaluated += 1
+        return self._is_same(u, self.n_evaluated - 1)
+
+    def _sample(self, low: Tensor, high: Tensor, count: int) -> Tensor:
+        """Return points (count, d) uniform in a box, other ones at every call."""
+        generator = torch.Generator().manual_seed(seeds.stream(self._seed, "region", self._n_draws))
+        self._n_draws += 1
+        return torch.lerp(low, high, torch.rand(count, len(self._center), generator=generator))
