@@ -72,6 +72,7 @@ if TYPE_CHECKING:
     from advsearch.scene import library as library
     from advsearch.scene import parts as parts
     from advsearch.scene.description import SceneDescription as SceneDescription
+    from advsearch.settings import Clash as Clash
     from advsearch.settings import Config as Config
     from advsearch.settings import setting as setting
     from advsearch.settings import setting_as_in as setting_as_in
@@ -101,7 +102,7 @@ _NAMES = {
     "advsearch.runs.store": ("Store",),
     "advsearch.runs.summary": ("read_result",),
     "advsearch.scene.description": ("SceneDescription",),
-    "advsearch.settings": ("Config", "setting", "setting_as_in"),
+    "advsearch.settings": ("Clash", "Config", "setting", "setting_as_in"),
     "advsearch.tasks": ("Facts", "Judgement", "Prediction", "Task"),
 }
 """The names of the interface, by the module that each is imported from."""

@@ -81,7 +81,6 @@ NOT_YET: frozenset[str] = frozenset(
 CORE_NOT_YET: frozenset[str] = frozenset(
     {
         "advsearch/api/projection.py",
-        "advsearch/api/workbench.py",
         "advsearch/engine/journal.py",
         "advsearch/questions/attack/carry_out.py",
         "advsearch/scene/importing/usd_layers.py",

@@ -69,10 +69,6 @@ from advsearch.questions.attack.carry_out import problem_on as problem_on
 from advsearch.questions.attack.result import AttackResult as AttackResult
 from advsearch.questions.attack.summary import AttackSummary as AttackSummary
 from advsearch.questions.attack.summary import attack_of as attack_of
-from advsearch.questions.photographs.carry_out import Photographs as Photographs
-from advsearch.questions.photographs.carry_out import photographs_in as photographs_in
-from advsearch.questions.photographs.result import LOOSE_PHOTO as LOOSE_PHOTO
-from advsearch.questions.photographs.result import PHOTO as PHOTO
 from advsearch.questions.sweep.carry_out import row_parameters as row_parameters
 from advsearch.questions.sweep.display import surface_sentences as surface_sentences
 from advsearch.questions.sweep.predicting import prepare_surface_light as prepare_surface_light

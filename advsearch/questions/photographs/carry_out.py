@@ -110,7 +110,13 @@ def photographs_in(folder: Path, task: AnyTask) -> list[Path]:
 
 
 class Photographs:
-    """Takes photographs in for runs; one at a time, from any thread. What the last run was about stays loaded."""
+    """Takes photographs in for runs; one at a time, from any thread. What the last run was about stays loaded.
+
+    Attributes:
+        row_kinds: the kinds of rows that photographs have in the results of a run.
+    """
+
+    row_kinds = (PHOTO, LOOSE_PHOTO)
 
     def __init__(self) -> None:
         self._judges = lru_cache(maxsize=1)(_judges_of)

@@ -105,8 +105,9 @@ def check_described(recipe: Recipe, config: RecipeConfig) -> None:
             raise InputError(
                 f"photographs: {config.recipe} keeps no pictures to compare them with; recipe realism does"
             )
+        photographs = workbench.load_photographs()
         for run in wanted:
-            workbench.photographs_in(Path(config.photographs) / Path(run.config.object).stem, run.config.task)
+            photographs.list_files(Path(config.photographs) / Path(run.config.object).stem, run.config.task)
     for figure in recipe.figures:
         kind, _ = read_options(figure, config.recipe)
         if kind == "cues" and config.task_name == wording.DETECTION:
@@ -219,10 +220,11 @@ def around(config: SceneConfig, distribution: Any, searched: Mapping[str, Any]) 
 
 def _take(folder: Path, wanted: Sequence[PlannedRun], run: RunDirectory) -> list[str]:
     """Take the photographs in a folder into the runs that are compared with some; return what is missing."""
-    photographs, missing = workbench.Photographs(), list[str]()
+    photographs = workbench.load_photographs()
+    missing = list[str]()
     for each in wanted:
         inside = folder / Path(each.config.object).stem
-        files = workbench.photographs_in(inside, each.config.task)
+        files = photographs.list_files(inside, each.config.task)
         photographs.add_files(RunDirectory.locate_part(run.path, each.name), files)
         missing += [] if files else [f"{each.config.object}: {inside} has no photographs."]
     if len(missing) == len(wanted):
@@ -238,7 +240,7 @@ def _figures(
     for run, result in done:
         kinds: dict[str, Sequence[str]] = {run.part: tuple(TRIALS)}
         if isinstance(run.config, SweepConfig):
-            kinds = {run.part: ("sweep",), PHOTOGRAPHS: (workbench.PHOTO, workbench.LOOSE_PHOTO)}
+            kinds = {run.part: ("sweep",), PHOTOGRAPHS: workbench.load_photographs().row_kinds}
             surfaces |= {run.name: result.surface} if result.surface else {}
         workers = getattr(run.config, WORKERS, None)
         more = {} if workers is None else {WORKERS: workers}
