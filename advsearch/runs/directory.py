@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, final
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
 from advsearch.runs import files, store, summary
 from advsearch.runs.trackers import Tracker, check_tracker
+from advsearch.settings import CONFIG as CONFIG
 from advsearch.settings import HEADER, PythonOnly, settings
 from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import (
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 
 HOME = Path("runs")  # where runs live that are called by name, in the current directory
 
-CONFIG = "run.yaml"
 REPORT = "report.html"
 COLUMNS = "columns.bin"  # of a sweep that has ended: its rows as columns of numbers (advsearch/viewer/columns.py)
 IMAGES = "images"

@@ -5,8 +5,20 @@
 
 from __future__ import annotations
 
-from advsearch.settings.configuration import FILES, Clash, Config, PythonOnly, Setting, setting, setting_as_in, settings
+from advsearch.settings.configuration import (
+    FILES,
+    Clash,
+    Config,
+    PythonOnly,
+    Setting,
+    python_only_text,
+    setting,
+    setting_as_in,
+    settings,
+)
 from advsearch.settings.values import (
+    CONFIG,
+    FOR_ALL,
     HEADER,
     all_finite,
     as_python,
@@ -16,6 +28,7 @@ from advsearch.settings.values import (
     names_together,
     number_or_text,
     parse_assignment,
+    parse_choices,
     read_controls,
     read_yaml,
     shown,
@@ -24,7 +37,9 @@ from advsearch.settings.values import (
 )
 
 __all__ = [
+    "CONFIG",
     "FILES",
+    "FOR_ALL",
     "HEADER",
     "Clash",
     "Config",
@@ -38,6 +53,8 @@ __all__ = [
     "names_together",
     "number_or_text",
     "parse_assignment",
+    "parse_choices",
+    "python_only_text",
     "read_controls",
     "read_yaml",
     "setting",

@@ -251,7 +251,7 @@ def test_what_an_attack_takes_beside_its_settings_is_read_as_they_are(asked: Cal
     assert (job.scene.description.environment_name, job.scene.description.values["camera.azimuth"]) == ("loft", 3.0)
     assert job.scene.description.values["camera.exposure"] == 1.0
     job = asked("mug", policy={"name": "pgd", "momentum": np.float64(0.5)}, camera=["orbit"], task=["classification"])
-    assert "momentum: 0.5" in job.config.command_line() and job.policy == "pgd"
+    assert "momentum: 0.5" in job.config.to_yaml() and job.policy == "pgd"
     assert asked("mug", controls={"pose": {"yaw": np.array([0.0, 90.0])}}).config.controls == {
         "pose": {"yaw": [0.0, 90.0]}
     }
@@ -425,8 +425,7 @@ def test_what_exists_only_here_is_no_command(
     result = advsearch.attack(
         scene, "reference", objective=objective, run=run, **{**SMALL, "steps": 1, "resolution": 128}
     )
-    words = "No command repeats this: the objective <lambda> exists only in the Python session that asked."
-    assert result.summary.command_line == words
+    assert (result.summary.command_line, result.summary.python_only) == (None, ["the objective <lambda>"])
     page = (run / "report.html").read_text("utf-8")
     assert "the objective &lt;lambda&gt; exists only in" in page and f"advsearch run {run}" not in page
     assert "# But it can't be: the objective <lambda>" in (run / "run.yaml").read_text("utf-8")
@@ -438,9 +437,9 @@ def test_what_exists_only_here_is_no_command(
     assert {row.ending for row in replayed.table} <= {"found", "budget spent", "not verified", "already wrong"}
     drawn = advsearch.load_scene(scene.description.object)
     swept = advsearch.sweep(drawn, "reference", {"pose.yaw": [0, 90]}, resolution=SIDE, spp=1, trials=0)
-    assert swept.summary.command_line.startswith("No command repeats this: the scene exists only in")
+    assert (swept.summary.command_line, swept.summary.python_only) == (None, ["the scene"])
     named = advsearch.attack(scene, advsearch.load_model("reference"), run=tmp_path / "named", **{**SMALL, "steps": 1})
-    assert named.summary.command_line.startswith("advsearch attack --object mug")
+    assert named.summary.command_line == f"advsearch run {tmp_path}/named/run.yaml" and not named.summary.python_only
     assert AttackConfig.from_yaml(tmp_path / "named" / "run.yaml").model == "reference"
 
 

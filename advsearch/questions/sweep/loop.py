@@ -313,7 +313,8 @@ class Sweep:
             seconds={**seconds, "total": self.stages.total},
             seed=job.config.seed,
             warnings=[*job.warnings, *self._remarks(predictions, checked, changes)],
-            command_line=job.config.command_line(),
+            command_line=job.config.command_line(None if run is None else run.path),
+            python_only=job.config.python_only,
         )
         if run is not None:
             for suffix, data in sweep_figure(summary).items():

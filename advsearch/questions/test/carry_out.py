@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import secrets
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
+from advsearch.settings.configuration import PLACE
 from advsearch.viewer.pages import keep_result
 
 NOTE = "suite"  # under which a run's store keeps the suite with its seed, so that it goes on as it began
@@ -146,15 +148,20 @@ class _SuiteRun:
         return ClaimResult(name=claim.name, kind=claim.kind, statement=text, answer=room.UNDECIDED, reason=reason)
 
     def _add(self, claim: PlannedClaim, tried: ClaimResult) -> None:
-        no = {"add": None, "run": None, "junit": None, "sarif": None, "markdown": None}
-        repeat = self._repeat(only=claim.name, update=False, overwrite=False, **no)
+        repeat = self._repeat_command(f"only={claim.name}") or ""
         expected = self.expected.get(claim.name, "held")
         self.results.append(tried.model_copy(update={"expected": expected, "repeat": repeat}))
 
-    def _repeat(self, **changes: object) -> str:
+    def _repeat_command(self, *changes: str) -> str | None:
+        """Return the command that tries the claims again with the same seed, and changes nothing but its own run."""
         config = self.trial.config
-        asked = config.model_copy(update={"seed": self.trial.suite.seed, "fresh": False, **changes})
-        return asked.with_only_here(config.only_here).command_line()
+        command = config.command_line(self.trial.run.path)
+        if command is None:
+            return None
+        defaults = {power.name: power.default for power in config.powers if power.name not in PLACE}
+        without = [f"{name}={json.dumps(default)}" for name, default in defaults.items()]
+        seed = ["fresh=false", f"seed={self.trial.suite.seed}"] if config.fresh else []
+        return f"{command} {shlex.join([*changes, *seed, *without])}".rstrip()
 
     def result(self, ending: str, added: Counterexample | None) -> SuiteResult:
         config, suite = self.trial.config, self.trial.suite
@@ -173,7 +180,7 @@ class _SuiteRun:
             answer=room.verdict(results), confidence=suite.confidence, claims=results, ending=ending,
             added=None if added is None else str(added.path), changes=changes,
             warnings=list(dict.fromkeys(self.trial.warnings)), seconds={"total": self.trial.passed}, seed=suite.seed,
-            command_line=self._repeat(),
+            command_line=self._repeat_command(), python_only=config.python_only,
         )  # fmt: skip
 
 
