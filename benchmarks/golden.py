@@ -66,7 +66,7 @@ FORMS = {
 """Controls that are attacked in a small form."""
 TIMES = ("second", "time", "date", "start", "started", "created", "rate", "per_second")
 """Words of columns and keys that are about time."""
-PLACES = ("run", "path", "folder", "resume", "version", "versions", "machine", "command", "argv", "repeat")
+PLACES = ("run", "path", "folder", "resume", "version", "versions", "machine", "command", "command_line", "repeat")
 """Keys that are about where a run lies and what it ran on."""
 
 
