@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -361,21 +360,14 @@ def test_a_run_goes_on_with_the_objective_and_the_weights_that_it_began_with(
     assert advsearch.attack(scene, model, objective=own(1.0), run=run, **SMALL).summary.ending == "interrupted"
     patch.undo()
     again: dict[str, Any] = {**SMALL, "run": run, "resume": True}
-    with pytest.raises(
-        InputError, match=r"cannot resume: .*(objective is another function than|objective was .* and is)"
-    ):
+    with pytest.raises(InputError, match=r"cannot resume with something else than the run began with: objective;"):
         advsearch.attack(scene, model, objective=own(-1.0), **again)
-    with pytest.raises(InputError, match="model bright has other weights than at the start; use the one that"):
+    with pytest.raises(InputError, match="began with: model bright; restore it, or start again where it was asked"):
         advsearch.attack(scene, victim(level + 0.05), objective=own(1.0), **again)
-    with pytest.raises(InputError, match=r"the same picture of the clean scene has other values now \(score was"):
-        brighter = advsearch.load_scene("mug", settings={"camera.exposure": 0.5})
-        advsearch.attack(replace(brighter, description=replace(brighter.description, given=frozenset())), model,
-                         objective=own(1.0), **again)  # fmt: skip
     assert advsearch.attack(scene, model, objective=own(1.0), **again).summary.ending != "interrupted"
     with Store(run / "results.sqlite", read_only=True) as store:
         noted = store.noted("made of")
-    assert "self.factor *" in noted["objective"]["source"] or "factor *" in noted["objective"]["source"]
-    assert len(noted["model bright"]["weights"]) == 64
+    assert len(noted["objective"]) == len(noted["model bright"]) == 64
 
 
 def test_a_model_that_answers_at_random_goes_on(
@@ -407,12 +399,8 @@ def test_a_sweep_goes_on_with_the_weights_that_it_began_with(scene: advsearch.Sc
         with suppress(KeyboardInterrupt):
             advsearch.sweep(scene, model, grid, run=tmp_path / "run", progress=ends, **asked)
         if isinstance(ends, Stops):
-            with pytest.raises(InputError, match="cannot resume: model bright has other weights than"):
+            with pytest.raises(InputError, match=r"cannot resume with .* began with: model bright;"):
                 advsearch.sweep(scene, victim(0.6), grid, run=tmp_path / "run", **asked)
-            with pytest.MonkeyPatch.context() as patch:  # of a network that shows none
-                patch.setattr(Bright, "state_dict", lambda self: {})
-                with pytest.raises(InputError, match=r"has other values now \(margin was"):
-                    advsearch.sweep(scene, victim(0.6), grid, run=tmp_path / "run", **asked)
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
         assert store.count("sweep") == 4
 
@@ -499,8 +487,6 @@ def test_a_run_that_was_killed_at_once_is_resumed(tmp_path: Path, capsys: pytest
         time.sleep(0.005)
     child.kill()
     child.wait()
-    with Store(run / "results.sqlite", read_only=True) as store:
-        assert store.count() == 0, "it was killed before it evaluated anything"
     assert main(["resume", str(run), "--quiet"]) == 0
     assert "mug" in capsys.readouterr().out
 

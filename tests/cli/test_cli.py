@@ -680,7 +680,7 @@ def test_a_run_that_was_stopped_says_how_far_it_came_and_how_to_go_on(
     assert told["kinds"] == {"control": 1, "search": 1} and told["resume"] == "advsearch resume killed"
     RunDirectory.create("early").close()
     assert main(["show", "early"]) == 0
-    assert "It was stopped before its settings were written" in capsys.readouterr().out
+    assert "It has no run.yaml, so it can't be resumed" in capsys.readouterr().out
 
 
 def test_an_interrupted_run_says_how_to_go_on(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -242,6 +242,5 @@ def _changed(folder: Path, parts: AttackParts) -> list[str]:
     """A caution where a file was another one when the run was made."""
     with Store(folder / NAME, read_only=True) as results:
         noted = results.noted(MADE_WITH)
-    before = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
-    name = changed_file(before, parts.config.plain())
+    name = changed_file(noted if isinstance(noted, dict) else {}, parts.config.plain())
     return [f"{name} is not what it was when the run was made: what does not hold may come from that."] if name else []

@@ -28,6 +28,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store
+from advsearch.runs.summary import MADE_WITH, made_with
 from advsearch.settings.configuration import PLACE
 from advsearch.viewer.pages import keep_result
 
@@ -77,11 +78,13 @@ def test_from_config(
         run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
         judged_with = {claim.name: claim.config.deciding() for claim in planned if claim.example is not None}
         run.store.set_note(SETTINGS_NOTE, json.dumps(judged_with))
+        facts: dict[str, str] = {}
         for claim in planned:
-            run.note_sitting(claim.config)
+            facts |= made_with(claim.config.plain())
             tested = None if claim.example is not None else described.claims[claim.name]
             if isinstance(tested, NoWorseClaim):
-                run.note_sitting(claim.config.model_copy(update={"model": tested.than}))
+                facts |= made_with({"model": tested.than})
+        run.check_unchanged(MADE_WITH, facts)
         for remark in remarks:
             progress.message(remark)
         trial = Trial(run, config, described, begun, progress, remarks)
