@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
@@ -239,6 +239,12 @@ class RunDirectory:
             self._tracker.close()
             self._tracker = None
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing in it to lose: no result, part, row or answer that was paid for."""
+        has_files = any((self.path / name).exists() for name in (summary.NAME, PARTS))
+        return not has_files and self.store.count() == 0 and not self.store.has_answers
+
     def discard(self) -> None:
         """Remove what this run wrote, and the directory if that leaves it empty."""
         self._told()
@@ -261,8 +267,7 @@ class RunDirectory:
             finally:
                 self.close()
             return
-        kept = not self._began or any((self.path / name).exists() for name in (summary.NAME, PARTS))
-        if not kept and self.store.count() == 0 and not self.store.has_answers:
+        if self._began and self.is_empty:
             self.discard()
         else:
             self.close()
@@ -286,15 +291,13 @@ def begun(config: Config) -> Iterator[Path | None]:
     try:
         yield path
     except BaseException:
-        try:
-            with suppress(AdvsearchError), RunDirectory.resume(path) as run:
-                run._began = True
-                raise
-            raise
-        finally:
-            with suppress(OSError):
-                for folder in above:
-                    folder.rmdir()
+        with suppress(AdvsearchError), closing(RunDirectory.resume(path)) as run:
+            if run.is_empty:
+                run.discard()
+        with suppress(OSError):
+            for folder in above:
+                folder.rmdir()
+        raise
 
 
 def default_name(object_name: str, controls: Iterable[str]) -> str:
