@@ -139,7 +139,7 @@ class SceneConfig(Config):
     set_: dict[str, float | str | tuple[float, ...]] = setting(
         dict, "scene", "fix a parameter of the scene, such as camera.azimuth=130; may be repeated",
         "PARAMETER=VALUE with a finite number, a name or a list of numbers", alias="set", flag="--set",
-        metavar="PARAMETER=VALUE", form="assignments",
+        metavar="PARAMETER=VALUE",
     )
     things: str | None = setting(
         None, "scene", "what stands beside the object, in metres from it: x forwards, y to its left",
@@ -185,7 +185,7 @@ class SceneConfig(Config):
         "a limit for a model behind an address, such as calls=500: calls (2000), tokens and money of a run, seconds of "
         "an answer (120), requests at_once (4), and the prices per_call, per_million_in and per_million_out; may be "
         "repeated",
-        "LIMIT=NUMBER", metavar="LIMIT=NUMBER", form="assignments",
+        "LIMIT=NUMBER", metavar="LIMIT=NUMBER",
     )
     task: str | dict[str, JsonValue] = setting(
         "classification", "model",
@@ -201,7 +201,7 @@ class SceneConfig(Config):
     controls: ControlsByName = setting(
         lambda: {"texture": {}}, "search", "what may change in the scene, separated by commas",
         "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}", flag="--control", metavar="NAME",
-        form="controls", min_length=1,
+        read_texts=written.read_controls, min_length=1,
     )
     texture_resolution: int | None = setting(
         None, "search", "side length of the searched texture", unit="texels", otherwise="chosen from the object's own",
@@ -325,17 +325,10 @@ class SceneConfig(Config):
 
     @field_validator("controls", "over", mode="before", check_fields=False)
     @classmethod
-    def _controls_from_names(cls, value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {name: {} if given is None else given for name, given in by_key(value).items()}
-        names = [value] if isinstance(value, str) else value
-        listed = isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names)
-        return written.read_controls(names, "controls") if listed else value
-
-    @field_validator("estimators", mode="before", check_fields=False)
-    @classmethod
-    def _estimators_from_name(cls, value: Any) -> Any:
-        return {"*": value} if isinstance(value, str) else value
+    def _controls_with_options(cls, value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        return {name: {} if options is None else options for name, options in by_key(value).items()}
 
     @field_validator("resolution", mode="before")
     @classmethod
@@ -447,7 +440,8 @@ class DerivativeConfig(SceneConfig):
     estimators: dict[str, str] = setting(
         dict, "search", "force a gradient estimator",
         "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch check` shows the names",
-        alias="estimator", flag="--estimator", metavar="NAME", form="choices",
+        alias="estimator", flag="--estimator", metavar="NAME",
+        read_texts=written.parse_choices,
     )
     objective: str | None = setting(
         None, "search", "the objective that the search maximises", "the name of an objective",

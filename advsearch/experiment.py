@@ -133,7 +133,8 @@ class RunContext(ExitStack, Generic[Settings]):
             "run": str(self.run.path),
             "ending": self.ending,
             "seconds": seconds,
-            "command_line": settings.command_line(),
+            "command_line": settings.command_line(self.run.path),
+            "python_only": settings.python_only,
         }
         return result_type(**{**shared, **fields})
 

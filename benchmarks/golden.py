@@ -66,7 +66,7 @@ FORMS = {
 """Controls that are attacked in a small form."""
 TIMES = ("second", "time", "date", "start", "started", "created", "rate", "per_second")
 """Words of columns and keys that are about time."""
-PLACES = ("run", "path", "folder", "resume", "version", "versions", "machine", "command", "argv", "repeat")
+PLACES = ("run", "path", "folder", "resume", "version", "versions", "machine", "command", "command_line", "repeat")
 """Keys that are about where a run lies and what it ran on."""
 
 
@@ -349,7 +349,7 @@ def passing(key: str) -> bool:
 def differences(kept: Any, found: Any, place: str = "") -> Iterator[str]:
     """Yield where two results differ, with both values."""
     if isinstance(kept, dict) and isinstance(found, dict):
-        for key in sorted({*kept, *found}):
+        for key in sorted(key for key in {*kept, *found} if not passing(key)):
             inside = f"{place}.{key}" if place else key
             if key not in kept or key not in found:
                 if kept.get(key, found.get(key)) in (None, ""):

@@ -173,7 +173,7 @@ def _wrapped(text: str) -> str:
 def _flag_row(one: Setting) -> list[str]:
     """A flag, what it is, its values and its default, cut from its help text."""
     text = help_text(one).replace("%%", "%")
-    if one.form == "switch":
+    if one.is_switch:
         return [f"`{one.flag}`", text, "no value", ""]
     values, marked, default = text.removeprefix(f"{one.description}: ").partition(" (default: ")
     shown = "required" if one.required else default.removesuffix(")") if marked else ""

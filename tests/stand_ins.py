@@ -116,10 +116,7 @@ def attack_on(
 def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume: bool = False) -> Findings:
     """Carry out the attack in a folder, from the beginning or from where it is."""
     problem: Any = StandInProblem(pause)
-    open_run = RunDirectory.resume if resume else RunDirectory.create
-    with open_run(folder) as run:
-        if not resume:
-            run.write_config(config)
+    with RunDirectory.resume(folder) if resume else RunDirectory.create(folder, config=config) as run:
         stages = Stages(NullProgress())
         findings = attack_on(problem, config, make_policy(config.policy_name), stages, run).carry_out()
         if not findings.interrupted:

@@ -333,8 +333,7 @@ def test_the_predictor_of_the_page_is_as_good_as_a_render() -> None:
 
 @pytest.mark.docs
 def test_the_export_of_the_page_writes_a_file(tmp_path: Path) -> None:
-    with RunDirectory.create(str(tmp_path / "run")) as run:
-        run.write_config(AttackConfig(object="mug", controls="pose"))
+    with RunDirectory.create(str(tmp_path / "run"), config=AttackConfig(object="mug", controls="pose")) as run:
         run.record(Row("search", 0, score=0.5), Row("search", 1, score=0.25))
     write = code_with("development.md", "Writer(")["_npz"]
     told, text = write(SimpleNamespace(run=str(run.path), kind=None), tmp_path / "scores.npz")

@@ -152,7 +152,8 @@ def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_p
 
     assert (swept["task"], swept["correct"], swept["configurations"]) == ("fading", 2, 3)
     assert swept["worst"]["values"]["fade.amount"]["value"] == 1.0 and swept["worst"]["label_set"] == ["1.0"]
-    assert (widely["task"], widely["correct"]) == ("fading", 3) and "'fading={tolerance: 2}'" in widely["command_line"]
+    assert (widely["task"], widely["correct"]) == ("fading", 3)
+    assert "name: fading\n  tolerance: 2\n" in (tmp_path / "sweep" / "run.yaml").read_text("utf-8")
 
     (view,) = rendered["views"]
     assert view["answers"][0]["probability"] is None and 0.3 < float(view["answers"][0]["label"].split()[0]) < 0.5

@@ -1,13 +1,13 @@
 """Flags made from the settings of a command, and a configuration made from flags or from a file.
 
-Values stay text until the configuration reads them, so that a wrong one is reported in one way wherever it came from.
+Values are texts, which the configuration reads: a wrong one is reported in one way wherever it came from.
 """
 
 from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,16 +15,7 @@ from typing import Any, TypeVar
 from advsearch.config import CONFIGS
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.settings import (
-    Config,
-    Setting,
-    check_once,
-    parse_assignment,
-    read_controls,
-    read_yaml,
-    settings,
-    split_names,
-)
+from advsearch.settings import Config, Setting, read_yaml, settings, split_names
 from advsearch.trust.code import allow_named
 
 _NO_SETTINGS = {"code": "--code", "sheets": "--sheets", "paper": "--paper", "size": "--size"}
@@ -54,27 +45,24 @@ def add_settings(
         add = partial(headings[setting.group].add_argument, default=argparse.SUPPRESS)
         if setting.field == "object":
             add("--scene", metavar="FILE", help=SCENE)
-        options: dict[str, Any] = {"action": "store_const", "const": not setting.default}
-        if setting.form != "switch":
-            options = {"action": "store" if setting.form == "text" else "append", "metavar": setting.metavar}
+        options: dict[str, Any] = {"action": "append" if setting.repeats else "store", "metavar": setting.metavar}
+        if setting.is_switch:
+            options = {"action": "store_const", "const": not setting.default}
         add(setting.flag, dest=setting.field, help=help_text(setting), **options)
 
 
 def config_from(args: argparse.Namespace, config: type[AnyConfig], **otherwise: Any) -> AnyConfig:
     """Return the configuration of a kind that the flags describe, with values for settings that were not given. Raises
     InputError where a value is not allowed."""
-    typed: dict[str, Any] = {}
-    for setting in settings(config):
-        if setting.field in args:
-            text, read = getattr(args, setting.field), READERS.get(setting.form)
-            typed[setting.field] = text if read is None else read(text, setting.flag)
-    allow_named(typed)
+    typed = {setting.field: getattr(args, setting.field) for setting in settings(config) if setting.field in args}
     data = {**otherwise, **typed}
     if "scene" in args and data.get("object") is None:
         raise InputError(f"object: expected something in {args.scene}, got nothing; name one of {_inside(args.scene)}")
     if "scene" in args and isinstance(data.get("object"), str):
         data["object"] = ",".join(f"{args.scene}#{name}" for name in split_names(data["object"]))
-    return config(**data)
+    read = config(**data)
+    allow_named({name: getattr(read, name) for name in typed})
+    return read
 
 
 def command_in(file: str | Path) -> str:
@@ -114,7 +102,7 @@ def with_flags(message: str) -> str:
     """
     known = [setting for config in CONFIGS.values() for setting in settings(config)]
     flags = {**_NO_SETTINGS, **{setting.name: setting.flag for setting in known}}
-    switches = {setting.name for setting in known if setting.form == "switch"}
+    switches = {setting.name for setting in known if setting.is_switch}
 
     def written(match: re.Match[str]) -> str:
         name, value = match["name"], match["value"]
@@ -127,28 +115,5 @@ def with_flags(message: str) -> str:
 
 def help_text(setting: Setting) -> str:
     """Return what the help says of a setting; of a switch, what its flag does."""
-    text = setting.switched or setting.description if setting.form == "switch" else setting.text
+    text = setting.switched or setting.description if setting.is_switch else setting.text
     return text.replace("%", "%%")
-
-
-def _assignments(given: Sequence[str], flag: str) -> dict[str, object]:
-    pairs = [parse_assignment(text, flag) for text in given]
-    check_once((name for name, _ in pairs), flag)
-    return dict(pairs)
-
-
-def _choices(given: Sequence[str], flag: str) -> dict[str, object]:
-    return _assignments([text if "=" in text else f"*={text}" for text in given], flag)
-
-
-def _axes(given: Sequence[str], flag: str) -> dict[str, object]:
-    names = [text.partition("=")[0].strip() for text in given]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError(f"{flag} {twice[0]}: given twice; write all values in one, separated by commas")
-    # YAML would take some for numbers to the base of 60
-    quoted = [re.sub(r"=\s*([^\s\"'\[{].*)", lambda match: f'="{match[1]}"', text, count=1) for text in given]
-    return _assignments(quoted, flag)
-
-
-READERS = {"assignments": _assignments, "choices": _choices, "axes": _axes, "controls": read_controls}
-"""What reads the flags of each form that is not left to the configuration."""

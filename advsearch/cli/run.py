@@ -81,7 +81,7 @@ def resume(args: argparse.Namespace) -> int:
     """Do what is left of the run and print its result; of a run that is done, its result."""
     path, changes = find_run(args.run), changes_in(args.change)
     if not (path / CONFIG).is_file():
-        raise InputError(f"{path}: expected a run with its {CONFIG}, got none; it was stopped before it began")
+        raise InputError(f"{path}: expected a run with its {CONFIG}, got none; start it again")
     asked = command_in(path / CONFIG)
     # the map of a sweep's surface, or a recipe's figures anew, with the photographs that were taken since
     adds = asked == "recipe" or (changes.get("surface") is True and asked == "sweep")

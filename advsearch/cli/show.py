@@ -112,7 +112,7 @@ def _show_unfinished(run: Listed, as_json: bool) -> int:
     if go_on is not None:
         lines += ["", f"Go on with: {go_on}"]
     elif run.state == "stopped":
-        lines += ["", "It was stopped before its settings were written, so it can't be resumed; start again."]
+        lines += ["", "It has no run.yaml, so it can't be resumed; start again."]
     return output.say(as_json, {**vars(run), "run": run.path, "ending": None, "resume": go_on}, "\n".join(lines))
 
 

@@ -8,7 +8,6 @@ import hashlib
 import inspect
 import json
 import math
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -118,8 +117,6 @@ def lost(query: Query, why: str) -> Evaluation:
 
 
 MADE_OF = "made of"  # the note of functions and weights
-LONGEST = 10_000  # characters of a function's source that are noted
-NEAR, LEAST = 1e-3, 1e-4  # values of one picture are the same within this part of the larger, and this
 
 
 def check_made_of(
@@ -127,27 +124,14 @@ def check_made_of(
 ) -> None:
     """Note what networks and functions are, or refuse to go on with others than a run began with. A model behind an
     address keeps its answers in the run."""
-    now: dict[str, Any] = {}
+    facts: dict[str, str | None] = {}
     for model in models:
         for network in model.module.models if isinstance(model.module, Ensemble) else (model,):
             if isinstance(network.module, AskedModel):
                 network.module.keep_in(run.store)
-            now[f"model {network.name}"] = {"weights": weights_digest(network)}
-    now |= {name: _function(function) for name, function in (functions or {}).items() if function is not None}
-    before = run.store.noted(MADE_OF)
-    if not isinstance(before, dict):
-        run.store.set_note(MADE_OF, json.dumps(now))
-        return
-    for name, facts in now.items():
-        noted = before.get(name)
-        noted = noted if isinstance(noted, dict) else {}
-        for key, what in (("weights", "has other weights"), ("code", "is another function")):
-            same_python = key != "code" or noted.get("python") == facts.get("python")
-            if same_python and None not in (noted.get(key), facts.get(key)) and noted[key] != facts[key]:
-                raise InputError(
-                    f"{run.path}: cannot resume: {name} {what} than at the start; use the one that it began with, "
-                    f"or {run.again}"
-                )
+            facts[f"model {network.name}"] = weights_digest(network)
+    facts |= {name: code_digest(function) for name, function in (functions or {}).items() if function is not None}
+    run.check_unchanged(MADE_OF, {name: digest for name, digest in facts.items() if digest is not None})
 
 
 def weights_digest(model: Model) -> str | None:
@@ -164,35 +148,24 @@ def weights_digest(model: Model) -> str | None:
     return digest.hexdigest() if tensors else None
 
 
-def same(before: Sequence[float | None], now: Sequence[float | None]) -> bool:
-    """Whether values of a picture are those that they were; None is no number."""
-    numbers = [[math.inf if value is None else value for value in values] for values in (before, now)]
-    close = partial(math.isclose, rel_tol=NEAR, abs_tol=LEAST)
-    return len(before) == len(now) and all(map(close, *numbers))
-
-
-def finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
-
-
-def _function(function: Callable[..., Any]) -> dict[str, str | None]:
-    """A function's source, for a reader, and a digest of what it does, whatever it looks like."""
+def code_digest(function: Callable[..., Any]) -> str | None:
+    """Return a digest of what a function does, and of the arrays that an object holds which is called as one; None
+    where it has no Python code."""
     while isinstance(function, partial):
         function = function.func
     bare = inspect.unwrap(function)
     bare = getattr(bare, "__func__", bare)
+    arrays: list[Any] = []
     if not hasattr(bare, "__code__"):
+        arrays = [(name, _plain(value)) for name, value in sorted(getattr(bare, "__dict__", {}).items())]
+        arrays = [pair for pair in arrays if isinstance(pair[1], bytes)]
         bare = getattr(type(bare), "forward", None) or type(bare).__call__
-    try:
-        source: str | None = inspect.getsource(bare)[:LONGEST]
-    except (OSError, TypeError):
-        source = None
-    code, digest = getattr(bare, "__code__", None), None
-    if code is not None:
-        held = [_plain(cell) for cell in getattr(bare, "__closure__", None) or ()]
-        parts = _parts(code, getattr(bare, "__doc__", None)), _plain(getattr(bare, "__defaults__", None)), held
-        digest = hashlib.sha256(repr(parts).encode()).hexdigest()
-    return {"source": source, "code": digest, "python": "{}.{}".format(*sys.version_info)}
+    code = getattr(bare, "__code__", None)
+    if code is None:
+        return None
+    cells = [_plain(cell) for cell in getattr(bare, "__closure__", None) or ()]
+    parts = _parts(code, getattr(bare, "__doc__", None)), _plain(getattr(bare, "__defaults__", None)), cells, arrays
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
 def _parts(code: CodeType, text: str | None = None) -> tuple[Any, ...]:
@@ -202,7 +175,8 @@ def _parts(code: CodeType, text: str | None = None) -> tuple[Any, ...]:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers and texts, however deep; of anything else its type, since its text may be another one in each process."""
+    """Numbers and texts, however deep, and a digest of an array; of anything else its type, since its text may be
+    another one in each process."""
     if isinstance(value, CellType):
         try:
             return _plain(value.cell_contents)
@@ -212,6 +186,9 @@ def _plain(value: Any) -> Any:
         return [_plain(part) for part in value]
     if isinstance(value, frozenset):
         return sorted(map(repr, value))
+    if isinstance(value, (np.ndarray, Tensor)):
+        array = np.ascontiguousarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+        return hashlib.sha256(f"{array.dtype} {array.shape}".encode() + array.tobytes()).digest()
     return value if isinstance(value, (int, float, complex, str, bytes, type(None))) else type(value).__name__
 
 
@@ -396,18 +373,6 @@ class Journal:
     def set_note(self, key: str, value: Any) -> None:
         if self.run is not None:
             self.run.store.set_note(key, json.dumps(value))
-
-
-def other_numbers(run: RunDirectory | None, values: Mapping[str, tuple[float | None, float | None]]) -> InputError:
-    """Return the error of a run that goes on with another model or objective, from what these said and say."""
-    told = ", ".join(
-        f"{name} was {before} and is {now}" for name, (before, now) in values.items() if not same([before], [now])
-    )
-    path, again = ("", "") if run is None else (run.path, run.again)
-    return InputError(
-        f"{path}: cannot resume: the same picture of the clean scene has other values now ({told}), so the model, "
-        f"the objective or the scene has changed; use those that the run began with, or {again}"
-    )
 
 
 def digest(u: Tensor) -> bytes:

@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 
 LONG = 24  # Rows of a table of fields above which it is folded
 _ELSEWHERE = (
-    *("run", "object", "objects", "controls", "environment", "ending", "warnings", "seconds", "command_line"),
+    *("run", "object", "objects", "controls", "environment", "ending", "warnings", "seconds"),
+    *("command_line", "python_only"),
     *("figures", "model", "renders", "seed"),
 )
 """Fields that stand in the heading or below, or nowhere."""

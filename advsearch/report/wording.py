@@ -143,11 +143,6 @@ def margin_text(task: str) -> str:
     return _MARGINS.get(task, "below 0 where the prediction is wrong")
 
 
-def is_command(text: str) -> bool:
-    """Whether what a result says of asking the same again is a command; otherwise it says why there is none."""
-    return not text or text.startswith("advsearch ")
-
-
 def objective_label(objective: str) -> str:
     """Return an objective with its unit, for an axis: ``margin loss [logits]``."""
     named = objective_name(objective)

@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, final
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
 from advsearch.runs import files, store, summary
 from advsearch.runs.trackers import Tracker, check_tracker
-from advsearch.settings import HEADER, PythonOnly, settings
+from advsearch.settings import CONFIG as CONFIG
+from advsearch.settings import HEADER, PythonOnly, settings, shown
 from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import (
     LOCK,
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 
 HOME = Path("runs")  # where runs live that are called by name, in the current directory
 
-CONFIG = "run.yaml"
 REPORT = "report.html"
 COLUMNS = "columns.bin"  # of a sweep that has ended: its rows as columns of numbers (advsearch/viewer/columns.py)
 IMAGES = "images"
@@ -48,7 +48,8 @@ AOV_FOLDER = "aov"  # of a sweep: the ground truth of each picture, by its numbe
 PARTS = "parts"  # runs that a study consists of
 
 ONLY_HERE = "only in Python"  # the note of parts that no file and no command can name: pairs of role and name
-BEGUN_WITH = "settings"  # the note of what decides the run's numbers, as it was when the run began
+BEGUN_WITH = "settings"  # the note of settings that decide the run's numbers
+LONGEST_VALUE = 40  # characters of a value that an error states
 
 CONTENTS = (
     CONFIG, *(f"{store.NAME}{ending}" for ending in ("", "-wal", "-shm", "-journal")), summary.NAME, REPORT, COLUMNS,
@@ -74,10 +75,25 @@ class RunDirectory:
         self.store = store.Store(path / store.NAME)
 
     @classmethod
-    def create(cls, run: str | Path | None = None, *, overwrite: bool = False, default: str = "attack") -> RunDirectory:
-        """Make the directory of a new run, by name (kept in ``runs/``), path, or None for ``runs/<default>-NNN`` with
-        the next free number, and lock it; RunExistsError if there is something already. With `overwrite`, only a
-        directory that advsearch wrote is touched, and in it only what advsearch writes."""
+    def create(
+        cls,
+        run: str | Path | None = None,
+        *,
+        config: Config | None = None,
+        overwrite: bool = False,
+        default: str = "attack",
+    ) -> RunDirectory:
+        """Make the directory of a new run, lock it, and write `run.yaml`, from which `advsearch run` repeats the run.
+
+        With `overwrite`, only a directory that advsearch wrote is touched, and in it only what advsearch writes.
+
+        Args:
+            run: a name (kept in ``runs/``) or a path; None takes ``runs/<default>-NNN`` with the next free number.
+            config: what the run does; a run without it can't be repeated or resumed.
+
+        Raises:
+            RunExistsError: there is something already.
+        """
         path = _numbered(default) if run is None else run_path(run)
         check_there(path)  # or the folder of the study that it is a part of would be made
         check_free(path, overwrite=overwrite)
@@ -91,7 +107,12 @@ class RunDirectory:
                 with storage_errors(path):
                     _clear(path)
                 try:
+                    if config is not None:
+                        write_text(path / CONFIG, config.to_repeat().to_yaml())
                     made = cls(path, held)
+                    undo.callback(made.store.close)
+                    if config is not None:
+                        made._note_start(config)
                 except BaseException:
                     with suppress(OSError):
                         _clear(path)
@@ -119,13 +140,7 @@ class RunDirectory:
     def create_for(cls, config: Config) -> RunDirectory:
         """Make the directory that `config` asks for, with its `run.yaml`; errors as for `create`."""
         (place, overwrite), (first, *others) = config.place, config.title
-        run = cls.create(place, overwrite=overwrite, default=default_name(first, others))
-        try:
-            run.write_config(config)
-        except BaseException:
-            run.discard()
-            raise
-        return run
+        return cls.create(place, config=config, overwrite=overwrite, default=default_name(first, others))
 
     @classmethod
     def resume(cls, run: str | Path, config: Config | None = None) -> RunDirectory:
@@ -142,7 +157,6 @@ class RunDirectory:
             opened._began = False
             if config is not None:
                 opened._check_same(config)
-                opened.note_sitting(config)
             undo.pop_all()
         return opened
 
@@ -153,48 +167,51 @@ class RunDirectory:
             return "start again where it was asked, in Python"
         return f"start again with advsearch run {self.path / CONFIG}"
 
-    def _check_same(self, config: Config) -> None:
-        """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
-        now = config.deciding()
-        note = self.store.note(BEGUN_WITH)
-        try:
-            before = json.loads(note or "null")
-        except ValueError:
-            before = None
-        if not isinstance(before, dict):
-            got = "none" if note is None else "a damaged note"
-            raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got {got}")
-        changed = [name for name, value in before.items() if name in now and value != now[name]]
-        if changed:
-            differ = ", ".join(f"{name} was {before[name]!r} and is {now[name]!r}" for name in changed)
-            raise InputError(
-                f"{self.path}: cannot resume: {differ} now; set it back to what the run began with, or {self.again}"
-            )
-
-    def write_config(self, config: Config) -> Path:
-        """Write `run.yaml`, from which `advsearch run` repeats the run, and return its path.
-
-        What decides the numbers is noted in the store too, so that a file that was edited since is noticed.
-        """
-        self.store.set_note(BEGUN_WITH, json.dumps(config.deciding()))
+    def _note_start(self, config: Config) -> None:
+        """Note what decides the numbers of a new run."""
+        self.check_unchanged(BEGUN_WITH, config.deciding())
+        self.check_unchanged(summary.MADE_WITH, summary.made_with(_known_settings(config)))
         if config.only_here:
             self.store.set_note(ONLY_HERE, json.dumps(config.only_here))
-        self.note_sitting(config)
-        return write_text(self.path / CONFIG, config.to_repeat().to_yaml())
 
-    def note_sitting(self, config: Config) -> None:
-        """Note what this sitting is made with, after those before it; refuse files that are other ones now."""
-        noted = self.store.noted(summary.MADE_WITH)
-        before = noted if isinstance(noted, list) else []
-        known = {setting.name for setting in settings(type(config))}  # without those that the command does not have
-        values = {name: value for name, value in config.plain().items() if name in known}
-        now = summary.made_with(values)
-        if changed := summary.changed_file([one for one in before if isinstance(one, dict)], values):
-            raise InputError(
-                f"{self.path}: cannot resume: {changed} has changed since the run began; restore it, or {self.again}"
+    def _check_same(self, config: Config) -> None:
+        """Refuse settings, versions and files that decide other numbers than those that are stored."""
+        read_again = {
+            name: value for name, value in _known_settings(config).items() if name not in summary.NOT_READ_AGAIN
+        }
+        if self.store.note(BEGUN_WITH) is None and self.store.count():
+            raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got none")
+        self.check_unchanged(BEGUN_WITH, config.deciding())
+        self.check_unchanged(summary.MADE_WITH, summary.made_with(read_again))
+
+    def check_unchanged(self, note: str, facts: Mapping[str, Any]) -> None:
+        """Store facts that decide the numbers of the run under a note.
+
+        Raises:
+            InputError: a fact is not what it was when it was stored first; the run can't go on.
+        """
+        stored = self.store.noted(note)
+        before = {} if stored is None else stored
+        if not isinstance(before, dict):
+            got = type(before).__name__
+            raise FileFormatError(
+                f"{self.store.path}: expected what the run began with in the note {note!r}, got {got}"
             )
-        if now not in before:
-            self.store.set_note(summary.MADE_WITH, json.dumps([*before, now]))
+        if changed := summary.changed_facts(before, facts):
+            listed = ", ".join(_with_value(name, before.get(name)) for name in changed)
+            raise InputError(
+                f"{self.path}: cannot resume with something else than the run began with: {listed}; restore it, or "
+                f"{self.again}"
+            )
+        if not facts.keys() <= before.keys():
+            self.store.set_note(note, json.dumps({**facts, **before}))
+
+    def check_files_unchanged(self, used_settings: Iterable[Mapping[str, Any]]) -> None:
+        """Store the versions, files and weights that settings name; errors as for `check_unchanged`."""
+        facts = dict[str, str]()
+        for values in used_settings:
+            facts |= summary.made_with(values)
+        self.check_unchanged(summary.MADE_WITH, facts)
 
     def record(self, *rows: store.Row, told: store.Told | None = None) -> None:
         """Add evaluated configurations to the results, and what the last of them told its search; they survive a kill
@@ -209,8 +226,8 @@ class RunDirectory:
         return summary.file_digests(values)
 
     @staticmethod
-    def find_changed_file(before: Sequence[Mapping[str, object]], values: Mapping[str, Any]) -> str | None:
-        """Return the name of a file that settings name and whose digest is in none of those of before, or None."""
+    def find_changed_file(before: Mapping[str, object], values: Mapping[str, Any]) -> str | None:
+        """Return the name of a file that settings name and whose digest is another one than before, or None."""
         return summary.changed_file(before, values)
 
     @staticmethod
@@ -218,8 +235,7 @@ class RunDirectory:
         """Return the name of a file that settings name and that is another one than when a run was made, or None."""
         with store.Store.open_to_read(run) as results:
             noted = results.noted(summary.MADE_WITH)
-        before = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
-        return summary.changed_file(before, config.plain())
+        return summary.changed_file(noted if isinstance(noted, dict) else {}, config.plain())
 
     @staticmethod
     def read_python_only(run: str | Path) -> list[PythonOnly]:
@@ -271,6 +287,12 @@ class RunDirectory:
             self._tracker.close()
             self._tracker = None
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing in it to lose: no result, part, row or answer that was paid for."""
+        has_files = any((self.path / name).exists() for name in (summary.NAME, PARTS))
+        return not has_files and self.store.count() == 0 and not self.store.has_answers
+
     def discard(self) -> None:
         """Remove what this run wrote, and the directory if that leaves it empty."""
         self._told()
@@ -293,8 +315,7 @@ class RunDirectory:
             finally:
                 self.close()
             return
-        kept = not self._began or any((self.path / name).exists() for name in (summary.NAME, PARTS))
-        if not kept and self.store.count() == 0 and not self.store.has_answers:
+        if self._began and self.is_empty:
             self.discard()
         else:
             self.close()
@@ -318,15 +339,13 @@ def begun(config: Config) -> Iterator[Path | None]:
     try:
         yield path
     except BaseException:
-        try:
-            with suppress(AdvsearchError), RunDirectory.resume(path) as run:
-                run._began = True
-                raise
-            raise
-        finally:
-            with suppress(OSError):
-                for folder in above:
-                    folder.rmdir()
+        with suppress(AdvsearchError), closing(RunDirectory.resume(path)) as run:
+            if run.is_empty:
+                run.discard()
+        with suppress(OSError):
+            for folder in above:
+                folder.rmdir()
+        raise
 
 
 def default_name(object_name: str, controls: Iterable[str]) -> str:
@@ -400,7 +419,7 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
         raise RunExistsError(f"{path}: expected a folder for the run, got a file; choose another name with `run`")
     with storage_errors(path):
         bare = not path.exists() or all(_is_leftover(found) for found in path.iterdir())
-    if bare or _never_began(path):
+    if bare:
         return
     if not is_run(path):
         raise RunExistsError(f"{path}: the folder is not empty and not a run; choose another name with `run`")
@@ -432,25 +451,21 @@ def _clear(path: Path) -> None:
                 found.unlink()
 
 
-def _never_began(path: Path) -> bool:
-    """Whether a run was killed before its settings were written: there is nothing in it to lose."""
-    if (path / CONFIG).exists() or not files.is_results_database(path / store.NAME):
-        return False
-    with suppress(AdvsearchError):
-        if (path / summary.NAME).exists():
-            return False
-        if files.is_bare(path / store.NAME):
-            return True
-        with store.Store(path / store.NAME, read_only=True) as results:
-            return results.count() == 0
-    return False
+def _known_settings(config: Config) -> dict[str, Any]:
+    """Return the settings that the command has, by name, as JSON values."""
+    known = {setting.name for setting in settings(type(config))}
+    return {name: value for name, value in config.plain().items() if name in known}
+
+
+def _with_value(name: str, value: object) -> str:
+    """Return a name with the value that it had, where that is short."""
+    text = shown(value)
+    return name if value is None or len(text) > LONGEST_VALUE else f"{name} (was {text})"
 
 
 def _is_leftover(path: Path) -> bool:
-    """Whether it is what a kill leaves before there is a run: the lock, a part of a file, results without a byte."""
-    if path.name == store.NAME:
-        return path.is_file() and path.stat().st_size == 0
-    return path.name in (LOCK, f"{store.NAME}-journal") or path.name.startswith(PART)
+    """Whether it is what a kill leaves before there is a run: the lock, or a part of a file."""
+    return path.name == LOCK or path.name.startswith(PART)
 
 
 def _remove_if_bare(path: Path) -> None:

@@ -20,11 +20,8 @@ from advsearch.pictures import png_of
 from advsearch.trust.databases import (
     LARGEST,
     check_before_writing,
-    connect_to_read,
     protect,
-    read_schema,
     read_version,
-    readable,
 )
 from advsearch.trust.stored_files import open_regular
 from advsearch.trust.writing import replacing, storage_errors, write_bytes
@@ -94,23 +91,19 @@ def is_results_database(path: Path) -> bool:
     return header[:15] == b"SQLite format 3" and header[68:72] == APPLICATION_ID.to_bytes(4, "big")
 
 
-def is_bare(path: Path) -> bool:
-    """Return whether a file of ours has no tables yet: its process was killed as it made them."""
-    with readable(path), closing(connect_to_read(path)) as db:
-        return read_version(db) == 0 and not read_schema(db)
-
-
 def connect_to_write(path: Path) -> sqlite3.Connection:
+    """Open the file for writing; where there is none, it is made with its tables in one step."""
     check_before_writing(path)
-    with storage_errors(path):
-        db = sqlite3.connect(path)
-        protect(db)
-        if read_version(db) == 0 and not read_schema(db):
+    if not path.exists():
+        with replacing(path) as part, closing(sqlite3.connect(part)) as db:
             # there is nothing in it to lose yet, so the disk isn't waited for
             db.execute("PRAGMA synchronous = OFF")
             db.execute(f"PRAGMA application_id = {APPLICATION_ID}")  # before the log, so that the file itself has it
             db.execute("PRAGMA journal_mode = WAL")
             db.executescript(f"BEGIN; {SCHEMA} COMMIT;")
+    with storage_errors(path):
+        db = sqlite3.connect(path)
+        protect(db)
     return db
 
 

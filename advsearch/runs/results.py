@@ -122,7 +122,10 @@ class RunResult(Result):
     ending: str = Field(description="how it ended")
     seconds: Annotated[dict[str, JsonFloat], having("total")] = Field(description="by part of the work, and in `total`")
     seed: int = Field(description="the root seed")
-    command_line: str = Field(description="the command that asks the same again")
+    command_line: str | None = Field(description="the command that asks the same again; null where none does")
+    python_only: list[str] = Field(
+        default=[], description="parts that existed only in Python, so that no command asks the same; absent without"
+    )
 
     def to_dict(self) -> JsonObject:
         """Return the fields as JSON values, what a reader looks for first in front."""

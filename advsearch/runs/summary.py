@@ -10,7 +10,7 @@ import json
 import os
 import platform
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib import metadata
 from itertools import islice
@@ -113,7 +113,7 @@ def read_configuration(run: Path) -> NDArray[np.float32]:
     raise FileFormatError(f"{path}: expected numbers (d,) float32 in [0, 1], got something else")
 
 
-MADE_WITH = "made with"  # the note: a list, with an entry for each sitting
+MADE_WITH = "made with"  # the note of versions and of digests of files
 MOST_FILES = 20_000  # files of a folder that a digest is taken of, at most
 FOLDERS = {"task": "*/*", "model": "*"}
 """Settings that may name a folder, and which files in it decide: a task's pictures, or what `hf:FOLDER` consists of."""
@@ -171,17 +171,21 @@ def _bundled_names(value: object) -> set[str]:
     return {word.partition("@")[0].strip() for word in words}
 
 
-def changed_file(before: Sequence[Mapping[str, object]], settings: Mapping[str, object]) -> str | None:
-    """Return the name of a file that is another one now than in every sitting before; None where all are the same.
+def changed_facts(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+    """Return the names of facts that are others now than before; those that were not known before are none of them.
 
-    A file may have been moved, so that its name alone tells it.
+    A file is known by the last part of its path, since it may have been moved.
     """
+    known: dict[str, list[object]] = {}
+    for name, value in before.items():
+        known.setdefault(Path(name).name, []).append(value)
+    return [Path(name).name for name, value in now.items() if value not in known.get(Path(name).name, [value])]
+
+
+def changed_file(before: Mapping[str, object], settings: Mapping[str, object]) -> str | None:
+    """Return the name of a file of some settings that is another one now than before; None if all are the same."""
     again = {name: value for name, value in settings.items() if name not in NOT_READ_AGAIN}
-    for path, digest in file_digests(again).items():
-        known = {one[old] for one in before for old in one if Path(old).name == Path(path).name}
-        if known and digest not in known:
-            return Path(path).name
-    return None
+    return next(iter(changed_facts(before, file_digests(again))), None)
 
 
 def file_digests(settings: Mapping[str, object]) -> dict[str, str]:

@@ -13,11 +13,14 @@ from advsearch.settings.configuration import (
     PythonOnly,
     Setting,
     SettingsError,
+    python_only_text,
     setting,
     setting_as_in,
     settings,
 )
 from advsearch.settings.values import (
+    CONFIG,
+    FOR_ALL,
     HEADER,
     all_finite,
     as_python,
@@ -28,6 +31,7 @@ from advsearch.settings.values import (
     names_together,
     number_or_text,
     parse_assignment,
+    parse_choices,
     read_controls,
     read_yaml,
     shown,
@@ -37,7 +41,9 @@ from advsearch.settings.values import (
 from advsearch.trust import powers
 
 __all__ = [
+    "CONFIG",
     "FILES",
+    "FOR_ALL",
     "HEADER",
     "PLACE",
     "Clash",
@@ -54,7 +60,9 @@ __all__ = [
     "names_together",
     "number_or_text",
     "parse_assignment",
+    "parse_choices",
     "powers",
+    "python_only_text",
     "read_controls",
     "read_yaml",
     "setting",

@@ -1,6 +1,7 @@
 """What is declared of a setting, for the help, the docs, errors and checks alike, and configurations made of settings.
 
-A configuration is what a command needs to know, checked as a whole, and as words of a command line.
+A configuration is what a command needs to know, checked as a whole. Whatever it is made from, flags, YAML or Python,
+its class reads the values.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-Form = Literal["text", "switch", "names", "assignments", "axes", "choices", "controls"]
-"""How a setting is written on a command line: as text; as a flag alone; or as what may come again: names, NAME=VALUE,
-NAME=VALUES, NAME=CHOICE or a choice for all, NAME or NAME={OPTION: VALUE}."""
+ReadTexts = Callable[[Sequence[str], str], Mapping[str, object]]
+"""Reads texts into a mapping; the second argument is the name of the setting, for errors. Raises ValueError where they
+are something else."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +44,15 @@ class Setting:
     otherwise: str = ""  # what a default of None comes to
     flag: str = ""  # where that is not its name: "--control"
     metavar: str = ""  # what stands for the value in the help, where that is not the last word of its name
-    form: Form = "text"  # how it is written on a command line; what is true or false is a switch
+    repeats: bool = False  # whether its flag may be repeated; that of a mapping always may
+    read_texts: ReadTexts = written.parse_assignments  # reads the texts that a mapping may be written as
     switched: str = ""  # what the flag does, where that is the opposite of the description
     power: Power = none  # says what a value does beyond the run, which only a person may ask for (`trust.powers`)
     field: str = ""  # its name in the configuration
     name: str = ""  # its name in YAML
     required: bool = False
+    is_switch: bool = False  # its flag takes no value
+    is_mapping: bool = False  # its flag takes one name with a value
 
     @property
     def text(self) -> str:
@@ -72,19 +76,22 @@ def setting(
     otherwise: str = "",
     flag: str = "",
     metavar: str = "",
-    form: Form = "text",
+    repeats: bool = False,
+    read_texts: ReadTexts = written.parse_assignments,
     switched: str = "",
     power: Power = none,
     **constraints: Any,
 ) -> Any:
     """Return a pydantic field: of a `Setting`, with constraints of `pydantic.Field`."""
-    declared = Setting(default, group, description, expects, unit, otherwise, flag, metavar, form, switched, power)
+    declared = Setting(
+        default, group, description, expects, unit, otherwise, flag, metavar, repeats, read_texts, switched, power
+    )
     extra: Any = {"declared": declared, "constraints": constraints}
     make = {"default_factory": default} if callable(default) else {"default": default}
     return Field(**make, description=description, json_schema_extra=extra, **constraints)
 
 
-WORKED_OUT = ("field", "name", "required")  # of a `Setting`, by `settings`
+WORKED_OUT = ("field", "name", "required", "is_switch", "is_mapping")  # of a `Setting`, by `settings`
 
 
 def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
@@ -111,6 +118,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
             continue
         extra: Any = info.json_schema_extra
         declared: Setting = extra["declared"]
+        is_mapping = get_origin(info.annotation) is dict
         complete.append(
             replace(
                 declared,
@@ -121,7 +129,9 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
                 flag=declared.flag or "--" + field.replace("_", "-"),
                 expects=declared.expects or _expected(info),
                 metavar=declared.metavar or field.rpartition("_")[2].upper(),
-                form="switch" if info.annotation is bool else declared.form,
+                repeats=declared.repeats or is_mapping,
+                is_switch=info.annotation is bool,
+                is_mapping=is_mapping,
             )
         )
     return tuple(complete)
@@ -140,39 +150,6 @@ def _expected(info: FieldInfo) -> str:
     if "gt" in limits:
         return f"{number} greater than {limits['gt']:g} and at most {most}"
     return f"{number} from {limits['ge']:g} to {most}"
-
-
-def as_flags(setting: Setting, value: Any) -> list[str]:
-    """Return the words of a command line that give `setting` the value."""
-    if setting.form == "switch":
-        return [setting.flag]
-    if setting.form in ("assignments", "axes", "choices"):
-        return [word for name, given in value.items() for word in (setting.flag, f"{name}={_number(given)}")]
-    if setting.form == "controls":
-        plain, tuned = [name for name in value if not value[name]], [name for name in value if value[name]]
-        words = [setting.flag, ",".join(plain)] if plain else []
-        return words + [word for name in tuned for word in (setting.flag, f"{name}={_flow(value[name])}")]
-    if setting.field == "epsilon" and isinstance(value, (dict, tuple)):
-        pairs = [f"{name}={_number(given)}" for name, given in value.items()] if isinstance(value, dict) else value
-        return [setting.flag, ",".join(map(str, pairs))]
-    if setting.field in written.NAMED and isinstance(value, dict):
-        options = {name: given for name, given in value.items() if name != "name"}
-        return [setting.flag, f"{value['name']}={_flow(options)}"]
-    if setting.field == "resolution":
-        return ["--resolution", "x".join(str(side) for side in value)]
-    if setting.field == "value_range":
-        return [f"{setting.flag}={','.join(_number(end) for end in value)}"]  # the first may be negative
-    return [f"{setting.flag}={_number(value)}"] if str(value).startswith("-") else [setting.flag, _number(value)]
-
-
-def _flow(value: Any) -> str:
-    return str(yaml.safe_dump(value, default_flow_style=True, width=10**6, sort_keys=False)).strip()
-
-
-def _number(value: Any) -> str:
-    if isinstance(value, (list, tuple)):
-        return "[" + ",".join(_number(part) for part in value) + "]"
-    return repr(int(value)) if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 else str(value)
 
 
 PLACE: Mapping[str, bool | None] = {"run": None, "overwrite": False}
@@ -225,11 +202,11 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
     def __init__(self, **data: Any) -> None:
-        deep = {name: value for name, value in data.items() if not is_shallow(value)}
-        if deep:
-            raise _settings_error(type(self), [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])
+        _check_shallow(type(self), data)
+        values = _mappings_from_texts(type(self), written.as_python(data))
+        _check_shallow(type(self), values)
         try:
-            super().__init__(**written.as_python(data))
+            super().__init__(**values)
         except ValidationError as error:
             raise _settings_error(type(self), error.errors(include_url=False)) from None
 
@@ -339,7 +316,9 @@ class Config(BaseModel):
     def to_yaml(self) -> str:
         """Return the YAML form; `from_yaml` of it gives an equal configuration, where no `powers` are in it."""
         data = {"schema": written.SCHEMA, "command": self.command, **self.plain()}
-        note = f"# But it can't be: {self._in_words()}\n" if self._only_here else ""
+        note = ""
+        if self._only_here:
+            note = f"# But it can't be: {python_only_text(self.python_only)}\n"
         return written.HEADER + note + str(yaml.safe_dump(data, sort_keys=False))
 
     def plain(self) -> JsonObject:
@@ -362,6 +341,17 @@ class Config(BaseModel):
         absolute = {name: ",".join(map(_absolute, written.split_names(value))) for name, value in named.items()}
         return self.model_copy(update={**absolute, **PLACE})
 
+    def command_line(self, run: str | Path | None) -> str | None:
+        """Return the shell command that repeats the run of this that is kept in a folder; None where none does."""
+        if run is None or self._only_here:
+            return None
+        return shlex.join(["advsearch", "run", str(Path(run) / written.CONFIG)])
+
+    @property
+    def python_only(self) -> list[str]:
+        """The parts that exist only in this Python session, in words."""
+        return [part.text for part in self._only_here]
+
     def deciding(self) -> JsonObject:
         """Return the settings that decide a run's numbers, as JSON values: all that are not `free`. Files have their
         names only, since they may have been moved."""
@@ -373,22 +363,36 @@ class Config(BaseModel):
                 )
         return given
 
-    def command_line(self) -> str:
-        """Return the shell command that repeats this in a place of its own: all settings that are not the default.
-        Where there is no such command, it is a sentence that says so."""
-        if self._only_here:
-            return f"No command repeats this: {self._in_words()}"
-        words = ["advsearch", self.command]
-        for one in settings(type(self)):
-            value = getattr(self, one.field)
-            if value != one.default and one.field not in PLACE:
-                words += as_flags(one, value)
-        return shlex.join(words)
 
-    def _in_words(self) -> str:
-        *first, last = (written.shown(part.text) for part in self._only_here)
-        listed = f"{', '.join(first)} and {last}" if first else last
-        return f"{listed} {'exist' if first else 'exists'} only in the Python session that asked."
+def _check_shallow(config: type[Config], data: Mapping[str, Any]) -> None:
+    deep = {name: value for name, value in data.items() if not is_shallow(value)}
+    if deep:
+        raise _settings_error(config, [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])
+
+
+def _mappings_from_texts(config: type[Config], data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values of settings; those of mappings that are written as a text, or as several, are read."""
+    values = dict(data)
+    for setting in settings(config):
+        if not setting.is_mapping:
+            continue
+        for name in {setting.name, setting.field} & values.keys():
+            value = values[name]
+            texts = [value] if isinstance(value, str) else value
+            if isinstance(texts, (list, tuple)) and texts and all(isinstance(text, str) for text in texts):
+                try:
+                    values[name] = setting.read_texts(texts, setting.name)
+                except ValueError:
+                    got = texts[0] if len(texts) == 1 else texts
+                    raise _settings_error(config, [{"loc": (name,), "input": got, "type": ""}]) from None
+    return values
+
+
+def python_only_text(parts: Sequence[str]) -> str:
+    """Return why no command repeats a run with parts that existed only in Python."""
+    *first, last = map(written.shown, parts)
+    listed = f"{', '.join(first)} and {last}" if first else last
+    return f"{listed} {'exist' if first else 'exists'} only in the Python session that asked."
 
 
 def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:
@@ -400,7 +404,7 @@ def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchErr
         if name not in known:
             return UnknownNameError("setting", name, {each.name for each in declared})
         got = "nothing" if error["type"] == "missing" else written.shown(error["input"])
-        if known[name].form in ("assignments", "controls") and len(error["loc"]) > 1:
+        if known[name].is_mapping and len(error["loc"]) > 1:
             got = f"{error['loc'][1]}={got}"
         problems.setdefault(known[name].name, f"expected {known[name].expects}, got {got}")
     return SettingsError(tuple(problems.items()))

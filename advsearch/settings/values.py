@@ -99,15 +99,37 @@ def parse_assignment(text: str, where: str) -> tuple[str, Any]:
         return name.strip(), value.strip()
 
 
-def read_controls(given: Iterable[str], where: str) -> dict[str, object]:
+def parse_assignments(texts: Iterable[str], setting: str) -> dict[str, object]:
+    """Return name to value from ``NAME=VALUE`` each, as `parse_assignment`. Raises ValueError: a text is no assignment;
+    InputError: a name comes twice."""
+    texts = list(texts)
+    if not all(name.strip() and sign for name, sign, _ in (text.partition("=") for text in texts)):
+        raise ValueError("not an assignment")
+    pairs = [parse_assignment(text, setting) for text in texts]
+    check_once((name for name, _ in pairs), setting)
+    return dict(pairs)
+
+
+FOR_ALL = "*"  # the name of a choice that is for everything that has none of its own
+
+
+def parse_choices(texts: Iterable[str], setting: str) -> dict[str, object]:
+    """Return what `parse_assignments` returns; a text without a name is the choice `FOR_ALL`, as it stands there."""
+    pairs = [parse_assignment(text, setting) if "=" in text else (FOR_ALL, text) for text in texts]
+    check_once((name for name, _ in pairs), setting)
+    return dict(pairs)
+
+
+def read_controls(texts: Iterable[str], where: str) -> dict[str, object]:
     """Return control to settings from texts: ``texture,pose``, ``texture={resolution: 64}``, ``pose={...},x={...}``."""
     controls: list[tuple[str, Any]] = []
-    for part in (part for text in given for part in _parts(text) if part.strip()):
+    for part in (part for text in texts for part in _parts(text) if part.strip()):
         name, settings = parse_assignment(part, where) if "=" in part else (part.strip(), {})
         if isinstance(settings, str) and settings.startswith("{"):
             raise InputError(
-                f"{where} {name}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}}, got {shown(settings)}; write a "
-                "colon and a space behind each parameter, close every bracket, and put a comma before the next control"
+                f"{where}: expected {{PARAMETER: VALUE or [LOW, HIGH], ...}} for {name}, got {shown(settings)}; write "
+                "a colon and a space behind each parameter, close every bracket, and put a comma before the next "
+                "control"
             )
         controls.append((name, settings))
     check_once((name for name, _ in controls), where)
@@ -159,6 +181,7 @@ def shown(value: Any) -> str:
 
 
 SCHEMA = 2  # version of the YAML form
+CONFIG = "run.yaml"  # the file of a run that has its settings
 HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
 """First line of every `run.yaml` that advsearch writes; a run directory is recognised by it."""
 MOST_BASES = 4  # most files that a `base` names, and most that are one another's base

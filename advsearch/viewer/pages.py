@@ -17,11 +17,11 @@ from advsearch import registry
 from advsearch.errors import FileFormatError
 from advsearch.report import shown as showing
 from advsearch.report.shown import Html, Picture, ResultPart, ShownResult, element, join_html
-from advsearch.report.wording import is_command
 from advsearch.runs.directory import CONFIG, IMAGES, OBJECT_FILE, REPORT, RunDirectory
 from advsearch.runs.files import smaller_png
 from advsearch.runs.results import Result
 from advsearch.runs.summary import read_result
+from advsearch.settings import python_only_text
 from advsearch.trust.named_files import is_inside
 from advsearch.trust.stored_files import read_bytes
 from advsearch.trust.writing import write_text
@@ -97,14 +97,17 @@ def end_html(run: Path, result: Result, given: ShownResult) -> Html:
     """Return what stands at the end of a page: how the result came about, the commands that go on with what was stopped
     and that ask the same again, and all settings."""
     facts = {name[:1].upper() + name[1:]: text for name, text in showing.facts_of(result, given).items()}
-    recipe, command_line = run / CONFIG, getattr(result, "command_line", "")
+    recipe = run / CONFIG
     parts = [element("h2", "Cost and conditions"), document.facts_table(facts)]
     if result.goes_on:
         resume = shlex.join(["advsearch", "resume", str(run)])
         parts += [element("h2", "Go on"), element("pre", resume, class_="wrap")]
-    commands = [shlex.join(["advsearch", "run", str(recipe)])] if recipe.is_file() and is_command(command_line) else []
-    commands += [command_line] if command_line else []
-    parts += [element("h2", "Do it again"), *(element("pre", command, class_="wrap") for command in commands)]
+    again = ""
+    if python_only := getattr(result, "python_only", []):
+        again = f"No command repeats this: {python_only_text(python_only)}"
+    elif recipe.is_file():
+        again = shlex.join(["advsearch", "run", str(recipe)])
+    parts += [element("h2", "Do it again"), element("pre", again, class_="wrap")] if again else []
     settings = recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else ""
     if settings:
         whole = element("pre", settings, class_="wrap")

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -251,7 +250,7 @@ def test_what_an_attack_takes_beside_its_settings_is_read_as_they_are(asked: Cal
     assert (job.scene.description.environment_name, job.scene.description.values["camera.azimuth"]) == ("loft", 3.0)
     assert job.scene.description.values["camera.exposure"] == 1.0
     job = asked("mug", policy={"name": "pgd", "momentum": np.float64(0.5)}, camera=["orbit"], task=["classification"])
-    assert "momentum: 0.5" in job.config.command_line() and job.policy == "pgd"
+    assert "momentum: 0.5" in job.config.to_yaml() and job.policy == "pgd"
     assert asked("mug", controls={"pose": {"yaw": np.array([0.0, 90.0])}}).config.controls == {
         "pose": {"yaw": [0.0, 90.0]}
     }
@@ -361,21 +360,14 @@ def test_a_run_goes_on_with_the_objective_and_the_weights_that_it_began_with(
     assert advsearch.attack(scene, model, objective=own(1.0), run=run, **SMALL).summary.ending == "interrupted"
     patch.undo()
     again: dict[str, Any] = {**SMALL, "run": run, "resume": True}
-    with pytest.raises(
-        InputError, match=r"cannot resume: .*(objective is another function than|objective was .* and is)"
-    ):
+    with pytest.raises(InputError, match=r"cannot resume with something else than the run began with: objective;"):
         advsearch.attack(scene, model, objective=own(-1.0), **again)
-    with pytest.raises(InputError, match="model bright has other weights than at the start; use the one that"):
+    with pytest.raises(InputError, match="began with: model bright; restore it, or start again where it was asked"):
         advsearch.attack(scene, victim(level + 0.05), objective=own(1.0), **again)
-    with pytest.raises(InputError, match=r"the same picture of the clean scene has other values now \(score was"):
-        brighter = advsearch.load_scene("mug", settings={"camera.exposure": 0.5})
-        advsearch.attack(replace(brighter, description=replace(brighter.description, given=frozenset())), model,
-                         objective=own(1.0), **again)  # fmt: skip
     assert advsearch.attack(scene, model, objective=own(1.0), **again).summary.ending != "interrupted"
     with Store(run / "results.sqlite", read_only=True) as store:
         noted = store.noted("made of")
-    assert "self.factor *" in noted["objective"]["source"] or "factor *" in noted["objective"]["source"]
-    assert len(noted["model bright"]["weights"]) == 64
+    assert len(noted["objective"]) == len(noted["model bright"]) == 64
 
 
 def test_a_model_that_answers_at_random_goes_on(
@@ -407,12 +399,8 @@ def test_a_sweep_goes_on_with_the_weights_that_it_began_with(scene: advsearch.Sc
         with suppress(KeyboardInterrupt):
             advsearch.sweep(scene, model, grid, run=tmp_path / "run", progress=ends, **asked)
         if isinstance(ends, Stops):
-            with pytest.raises(InputError, match="cannot resume: model bright has other weights than"):
+            with pytest.raises(InputError, match=r"cannot resume with .* began with: model bright;"):
                 advsearch.sweep(scene, victim(0.6), grid, run=tmp_path / "run", **asked)
-            with pytest.MonkeyPatch.context() as patch:  # of a network that shows none
-                patch.setattr(Bright, "state_dict", lambda self: {})
-                with pytest.raises(InputError, match=r"has other values now \(margin was"):
-                    advsearch.sweep(scene, victim(0.6), grid, run=tmp_path / "run", **asked)
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
         assert store.count("sweep") == 4
 
@@ -425,8 +413,7 @@ def test_what_exists_only_here_is_no_command(
     result = advsearch.attack(
         scene, "reference", objective=objective, run=run, **{**SMALL, "steps": 1, "resolution": 128}
     )
-    words = "No command repeats this: the objective <lambda> exists only in the Python session that asked."
-    assert result.summary.command_line == words
+    assert (result.summary.command_line, result.summary.python_only) == (None, ["the objective <lambda>"])
     page = (run / "report.html").read_text("utf-8")
     assert "the objective &lt;lambda&gt; exists only in" in page and f"advsearch run {run}" not in page
     assert "# But it can't be: the objective <lambda>" in (run / "run.yaml").read_text("utf-8")
@@ -438,9 +425,9 @@ def test_what_exists_only_here_is_no_command(
     assert {row.ending for row in replayed.table} <= {"found", "budget spent", "not verified", "already wrong"}
     drawn = advsearch.load_scene(scene.description.object)
     swept = advsearch.sweep(drawn, "reference", {"pose.yaw": [0, 90]}, resolution=SIDE, spp=1, trials=0)
-    assert swept.summary.command_line.startswith("No command repeats this: the scene exists only in")
+    assert (swept.summary.command_line, swept.summary.python_only) == (None, ["the scene"])
     named = advsearch.attack(scene, advsearch.load_model("reference"), run=tmp_path / "named", **{**SMALL, "steps": 1})
-    assert named.summary.command_line.startswith("advsearch attack --object mug")
+    assert named.summary.command_line == f"advsearch run {tmp_path}/named/run.yaml" and not named.summary.python_only
     assert AttackConfig.from_yaml(tmp_path / "named" / "run.yaml").model == "reference"
 
 
@@ -500,8 +487,6 @@ def test_a_run_that_was_killed_at_once_is_resumed(tmp_path: Path, capsys: pytest
         time.sleep(0.005)
     child.kill()
     child.wait()
-    with Store(run / "results.sqlite", read_only=True) as store:
-        assert store.count() == 0, "it was killed before it evaluated anything"
     assert main(["resume", str(run), "--quiet"]) == 0
     assert "mug" in capsys.readouterr().out
 

@@ -45,8 +45,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[AttackConfig]
 
     def attack(config: AttackConfig, *, progress: Any, clean: CleanMatrix | None = None) -> Any:
         done.append(config)
-        with RunDirectory.create(config.run, overwrite=config.overwrite) as run:
-            run.write_config(config)
+        with RunDirectory.create(config.run, overwrite=config.overwrite, config=config) as run:
             summary = summary_of(config, str(run.path))
             run.write_summary(summary)
         return SimpleNamespace(summary=summary)

@@ -131,7 +131,7 @@ def test_help_of_attack_shows_every_setting_with_range_and_default(capsys: pytes
     text = " ".join(capsys.readouterr().out.split())
     for setting in settings(AttackConfig):
         assert f"{setting.flag} " in text
-        if setting.form != "switch":
+        if not setting.is_switch:
             assert setting.expects in text and setting.unit in text
     assert "a whole number from 1 to 1000000 (default: 40; for textures and the like with --over " in text
     assert "in texels (default: chosen from the object's own)" in text
@@ -158,7 +158,7 @@ def test_no_command_prints_help_and_version_is_told(capsys: pytest.CaptureFixtur
         (["attack", "--object", "mug", "--epsilon", "nan"], "--epsilon: expected a number greater than 0 and at"),
         (["attack", "--object", "mug", "--epsilon", "-0.1"], "--epsilon: expected a number greater than 0 and at"),
         (["attack", "--object", "mug", "--control", ","], "--control: expected names of controls, or NAME="),
-        (["attack", "--object", "mug", "--set", "a"], "--set: expected NAME=VALUE such as camera.azimuth=130, got 'a'"),
+        (["attack", "--object", "mug", "--set", "a"], "--set: expected PARAMETER=VALUE with a finite number"),
         (["attack", "--object", "mug", "--set", "a=nan"], "--set: expected PARAMETER=VALUE with a finite number"),
         (["run"], "the following arguments are required: FILE"),
         (["run", "no.yaml"], "no.yaml: expected a YAML file, got No such file or directory; check the path"),
@@ -680,7 +680,7 @@ def test_a_run_that_was_stopped_says_how_far_it_came_and_how_to_go_on(
     assert told["kinds"] == {"control": 1, "search": 1} and told["resume"] == "advsearch resume killed"
     RunDirectory.create("early").close()
     assert main(["show", "early"]) == 0
-    assert "It was stopped before its settings were written" in capsys.readouterr().out
+    assert "It has no run.yaml, so it can't be resumed" in capsys.readouterr().out
 
 
 def test_an_interrupted_run_says_how_to_go_on(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -64,8 +64,7 @@ def stopped_run(**settings: object) -> None:
     """The folder of a run that somebody else has begun, beside Python code that leaves a trace."""
     Path("planted.py").write_text(PLANTED, encoding="utf-8")
     config = AttackConfig(object="mug", **{"resolution": 16, **settings})
-    with RunDirectory.create("theirs") as run:
-        run.write_config(config)
+    with RunDirectory.create("theirs", config=config) as run:
         run.store.append([])
 
 

@@ -58,7 +58,7 @@ def kill_and_resume(folder: Path, policy: str) -> int:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
         kills += 1
-        begun = (folder / "results.sqlite").exists() and (folder / "run.yaml").exists()
+        begun = (folder / "run.yaml").exists()
     raise AssertionError("it does not get on")
 
 
@@ -96,8 +96,7 @@ def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     problem: Any = StandInProblem(on_evaluation=counted)
-    with RunDirectory.create(tmp_path / "run") as run:
-        run.write_config(config)
+    with RunDirectory.create(tmp_path / "run", config=config) as run:
         attack = attack_on(problem, config, make_policy("pgd"), Stages(NullProgress()), run)
         assert attack.carry_out().interrupted
     assert can_resume(tmp_path / "run")
@@ -163,12 +162,11 @@ CHANGES: dict[str, Any] = {
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_run_goes_on_with_the_settings_that_it_began_with(tmp_path: Path, name: str) -> None:
-    with RunDirectory.create(tmp_path / "run") as run:
-        run.write_config(configuration())
+    with RunDirectory.create(tmp_path / "run", config=configuration()) as run:
         run.record(Row(kind="search", step=0))
     recipe = tmp_path / "run" / "run.yaml"
     edited = AttackConfig.from_yaml(recipe, {name: CHANGES[name]})
-    with pytest.raises(InputError, match=rf"cannot resume: {name} was .* and is .* now; set it back to what"):
+    with pytest.raises(InputError, match=rf"with something else than the run began with: {name}\b.*; restore it"):
         RunDirectory.resume(tmp_path / "run", edited)
     with RunDirectory.resume(tmp_path / "run", AttackConfig.from_yaml(recipe)):  # and nothing is locked any more
         pass
@@ -178,37 +176,35 @@ def test_a_run_goes_on_elsewhere_on_other_threads_and_with_files_that_were_moved
     for folder in ("old", "new"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "net.pt2").touch()
-    with RunDirectory.create(tmp_path / "run") as run:
-        run.write_config(configuration(model=str(tmp_path / "old" / "net.pt2")))
+    with RunDirectory.create(tmp_path / "run", config=configuration(model=str(tmp_path / "old" / "net.pt2"))):
+        pass
     moved = configuration(model=str(tmp_path / "new" / "net.pt2"), threads=1, run="other", overwrite=True)
     with RunDirectory.resume(tmp_path / "run", moved):
         pass
-    with pytest.raises(InputError, match=r"model was 'net\.pt2' and is 'other\.pt2' now"):
+    with pytest.raises(InputError, match=r"began with: model \(was net\.pt2\); restore it"):
         RunDirectory.resume(tmp_path / "run", configuration(model="other.pt2"))
 
 
 @pytest.mark.parametrize("config", [CheckConfig(object="mug"), StabilityConfig()])
 def test_a_sitting_may_be_longer_than_the_one_before(tmp_path: Path, config: Config) -> None:
-    with RunDirectory.create(tmp_path / "run") as run:
-        run.write_config(config.model_copy(update={"seconds": 5.0}))
+    with RunDirectory.create(tmp_path / "run", config=config.model_copy(update={"seconds": 5.0})):
+        pass
     for seconds in (9.0, None):
         with RunDirectory.resume(tmp_path / "run", config.model_copy(update={"seconds": seconds})):
             pass
-    with RunDirectory.create(tmp_path / "search") as run:
-        run.write_config(configuration(seconds=5.0))
-    with pytest.raises(
-        InputError, match=r"seconds was 5\.0 and is 9\.0 now"
-    ):  # how long it searches decides the answer
+    with RunDirectory.create(tmp_path / "search", config=configuration(seconds=5.0)):
+        pass
+    with pytest.raises(InputError, match=r"seconds \(was 5\.0\)"):  # how long it searches decides the answer
         RunDirectory.resume(tmp_path / "search", configuration(seconds=9.0))
 
 
-@pytest.mark.parametrize(("note", "got"), [(None, "none"), ("[1,", "a damaged note"), ("[1]", "a damaged note")])
+@pytest.mark.parametrize(("note", "got"), [(None, "none"), ("[1,", ".*damaged"), ("[1]", "list")])
 def test_a_run_without_its_settings_does_not_go_on(tmp_path: Path, note: str | None, got: str) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
         run.record(Row(kind="search", step=0))
         if note is not None:
             run.store.set_note("settings", note)
-    with pytest.raises(FileFormatError, match=f"expected the settings the run began with, got {got}"):
+    with pytest.raises(FileFormatError, match=f"results.sqlite: expected .*, got {got}"):
         RunDirectory.resume(tmp_path / "run", configuration())
 
 
@@ -241,8 +237,7 @@ def test_two_processes_on_one_run_are_refused(tmp_path: Path) -> None:
         f"try: RunDirectory.resume({str(tmp_path / 'run')!r})\n"
         "except Exception as error: print(error); sys.exit(7)\n"
     )
-    with RunDirectory.create(tmp_path / "run") as run:
-        run.write_config(configuration())
+    with RunDirectory.create(tmp_path / "run", config=configuration()):
         other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert other.returncode == 7 and f"process {os.getpid()} is working on this run" in other.stdout
 
@@ -287,22 +282,20 @@ def test_the_random_searchs_configuration_is_taken_where_it_is_the_worse_one(pol
 def test_a_kill_while_the_results_were_made_leaves_a_folder_that_a_run_can_take(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
-    for name in ("results.sqlite", "results.sqlite-journal", ".lock"):
+    for name in (".part-7-results.sqlite", ".part-7-results.sqlite-wal", ".lock"):
         (folder / name).touch()
-    with RunDirectory.create(folder):
-        pass  # killed before the settings were written
-    with RunDirectory.create(folder) as run:
-        run.write_config(configuration())
+    with RunDirectory.create(folder, config=configuration()):
+        pass
     assert (folder / "run.yaml").is_file()
 
 
-def test_a_kill_before_the_results_had_tables_leaves_a_folder_that_a_run_can_take(tmp_path: Path) -> None:
+def test_a_run_that_was_killed_before_it_had_results_goes_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    folder.mkdir()
-    with closing(sqlite3.connect(folder / "results.sqlite")) as made:
-        made.execute(f"PRAGMA application_id = {files.APPLICATION_ID}")
-    with RunDirectory.create(folder) as run:
-        run.write_config(configuration())
+    with RunDirectory.create(folder, config=configuration()):
+        pass
+    (folder / "results.sqlite").unlink()
+    with RunDirectory.resume(folder, configuration()) as run:
+        assert run.store.noted("settings") == configuration().deciding()
     with closing(sqlite3.connect(tmp_path / "results.sqlite")) as made:
         made.execute(f"PRAGMA application_id = {files.APPLICATION_ID}")
         made.execute("CREATE TABLE others (text)")

@@ -515,12 +515,11 @@ def test_bad_settings_are_refused(given: dict[str, Any], message: str) -> None:
         PrecisionConfig(object="mug", **given)
 
 
-def test_settings_go_through_yaml_and_the_command_line(tmp_path: Path) -> None:
+def test_settings_go_through_yaml(tmp_path: Path) -> None:
     config = PrecisionConfig(object="mug", controls="pose", samplers=["independent", "stratified"])
     path = tmp_path / "run.yaml"
     path.write_text(config.to_yaml(), encoding="utf-8")
     assert PrecisionConfig.from_yaml(path) == config
-    assert config.command_line() == "advsearch precision --control pose --samplers independent,stratified"
     shared = AttackConfig.of(config, norm="l2")
     assert (shared.object, shared.controls, shared.objective, shared.norm) == ("mug", {"pose": {}}, None, "l2")
     assert (shared.steps, shared.seconds) == (None, None), "what only has the same name is not shared"

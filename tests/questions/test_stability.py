@@ -226,8 +226,8 @@ def test_a_suite_that_was_killed_in_its_first_case_says_what_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = StabilityConfig(case="good")
-    with RunDirectory.create("killed") as run:
-        run.write_config(config)
+    with RunDirectory.create("killed", config=config):
+        pass
     assert main(["show", "killed"]) == 0
     said = capsys.readouterr().out
     assert said.startswith("killed: stability.\n") and "Go on with: advsearch resume killed" in said

@@ -38,8 +38,7 @@ ROWS = (
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    with RunDirectory.create("one") as made:
-        made.write_config(AttackConfig(object="mug", controls="pose"))
+    with RunDirectory.create("one", config=AttackConfig(object="mug", controls="pose")) as made:
         made.record(*ROWS)
         return made.path
 
@@ -154,8 +153,7 @@ def test_runs_says_how_each_ended(run: Path, capsys: pytest.CaptureFixture[str])
     assert [(one.name, one.state, one.rows) for one in listed_runs(run.parent)] == [("one", "stopped", 3)]
     with RunDirectory.resume("one"):
         assert listed_runs(run.parent)[0].state == "running"
-    with RunDirectory.create("two") as other:
-        other.write_config(AttackConfig(object="bowl", controls="texture"))
+    with RunDirectory.create("two", config=AttackConfig(object="bowl", controls="texture")) as other:
         other.write_summary(attack(verified=rated(19)))
     with RunDirectory.create("three") as third:
         third.write_summary(attack(ending="interrupted", verified=None))

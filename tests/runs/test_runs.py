@@ -414,7 +414,7 @@ def test_a_run_does_not_go_on_with_another_file(home: Path, setting: str, value:
     for wanted in ("one", "another", "one"):
         Path(file).write_text(wanted)
         if wanted == "another":
-            with pytest.raises(InputError, match=f"cannot resume: {Path(file).parts[0]} has changed since"):
+            with pytest.raises(InputError, match=f"than the run began with: {Path(file).parts[0]};"):
                 RunDirectory.resume("first", config)
         else:
             (RunDirectory.resume("first", config) if Path("runs").is_dir() else RunDirectory.create_for(config)).close()
@@ -439,8 +439,8 @@ def test_a_recipe_that_a_run_has_kept_may_be_another_one(home: Path) -> None:
     recipe.write_text("one")
     noted = summary.made_with({"recipe": "own.yaml"})
     recipe.write_text("another")
-    assert summary.changed_file([noted], {"recipe": "own.yaml"}) is None
-    assert summary.changed_file([noted], {"camera": "own.yaml"}) == "own.yaml"
+    assert summary.changed_file(noted, {"recipe": "own.yaml"}) is None
+    assert summary.changed_file(noted, {"camera": "own.yaml"}) == "own.yaml"
 
 
 # ---- whole or not at all ----

@@ -334,7 +334,7 @@ def test_an_attack_is_verified(
         assert main(["resume", str(run)]) == 2
     finally:
         (rendered / "refs" / "bowl" / "more.png").unlink()
-    assert "cannot resume: refs has changed since the run began" in capsys.readouterr().err
+    assert "cannot resume with something else than the run began with: refs;" in capsys.readouterr().err
     monkeypatch.chdir(tmp_path)
     assert typed(capsys, "resume", str(run))["verified"] == found["verified"]
 

@@ -83,9 +83,7 @@ def page_of(run: Path) -> Page:
 
 
 def test_the_page_says_it_all(tmp_path: Path) -> None:
-    page = page_of(
-        make_run(tmp_path / "run", attack(warnings=["A texture is missing."], command_line="advsearch attack"))
-    )
+    page = page_of(make_run(tmp_path / "run", attack(warnings=["A texture is missing."])))
     for text in (
         "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %).",
         "A texture is missing.",
@@ -104,7 +102,6 @@ def test_the_page_says_it_all(tmp_path: Path) -> None:
         "14.6 s (setup 3.1 s, search 9.0 s, verification 2.2 s)",
         "128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops",
         f"advsearch run {tmp_path}/run/run.yaml",
-        "advsearch attack",
         "texture_resolution: null",
     ):
         assert text in page.text, text
@@ -203,7 +200,8 @@ def test_names_cannot_become_markup(tmp_path: Path) -> None:
     answer = {"label": evil, "index": 3, "probability": 0.5}
     summary = attack(
         object=evil, model=evil, environment=evil, controls=[evil], policy=evil, objective=evil, norm=evil,
-        warnings=[evil], adversarial=answer, run=evil, command_line=evil, clean={**ATTACK["clean"], **answer},
+        warnings=[evil], adversarial=answer, run=evil, command_line=None, python_only=[evil],
+        clean={**ATTACK["clean"], **answer},
         verified=rated(labels={evil: 20}), baseline={**ATTACK["baseline"], "policy": evil},
         image_formation={**FORMATION, "filter": evil}, renders={evil: 1}, seconds={evil: 1.0, "total": 2.0},
     )  # fmt: skip

@@ -53,7 +53,7 @@ def two_objects() -> Result:
         {**CURVE["table"][0], "object": name, "run": f"runs/x/parts/{name}", "average": average}
         for name in ("mug", "bowl")
     ]
-    return curve(table=rows, parts=["mug", "bowl"], command_line="advsearch attack --object mug,bowl --average 200")
+    return curve(table=rows, parts=["mug", "bowl"])
 
 
 def got(address: str) -> str:
@@ -87,7 +87,7 @@ def test_the_average_stands_beside_the_worst_case(tmp_path: Path) -> None:
     right = f"{AVERAGE['correct']}/{AVERAGE['configurations']} (75 %)"
     assert "ending epsilon wrong margin right on average 95 % interval" in text
     assert f"bowl 20/20 found 0.1 19/20 1.50 {right} 35-97 %" in text
-    assert "advsearch attack --object mug,bowl --average 200" in text
+    assert f"advsearch run {tmp_path}/study/run.yaml" in text
     assert 'href="parts/bowl/report.html"' in page
     without = text_of((make_study(tmp_path / "without", a_curve()) / "report.html").read_text())
     assert "right on average" not in without

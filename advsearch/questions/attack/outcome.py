@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from torch import Tensor
 
 from advsearch.attacks import Ending, SearchResult, count_right
+from advsearch.attacks.candidates import FoundFailure
 from advsearch.attacks.trials import MOST_TIMES, MOVED, OVER_LADDER
 from advsearch.engine.journal import Journal
 from advsearch.engine.judging import domain_of, print_terms
@@ -22,9 +23,39 @@ from advsearch.questions.attack import result as kept
 from advsearch.questions.attack.result import AttackResult, KeptPicture
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import UNPRINTED
-from advsearch.questions.attack.summary import AttackSummary, DifferentFailures
+from advsearch.questions.attack.summary import (
+    AmbientLight,
+    AmbientPoint,
+    AttackSummary,
+    BaselineSearch,
+    CleanPrediction,
+    DifferentFailure,
+    DifferentFailures,
+    FailingShare,
+    FoundValue,
+    NotFinite,
+    ObjectiveValues,
+    PathSegments,
+    PicturedPrediction,
+    Printability,
+    PrintCost,
+    SearchClaim,
+    SearchDistribution,
+    SearchGradients,
+    SmallestEpsilon,
+    TriedObjective,
+    VerificationSamples,
+)
 from advsearch.report.wording import number_text
-from advsearch.runs.results import SharedWork, VariedValue
+from advsearch.runs.results import (
+    AverageCase,
+    DescribedValue,
+    Formation,
+    MovedValue,
+    PrintTerms,
+    SharedWork,
+    VariedValue,
+)
 from advsearch.runs.summary import write_configuration
 from advsearch.tasks import Judgement
 from advsearch.tasks.base import Task, mean
@@ -60,152 +91,187 @@ def summarise(
         write_configuration(run.path, u.numpy())
     searched = None if search is None else u
     drive = None if findings.interrupted else kept.along_drive(problem, searched, findings.spp, run)
-    summary = AttackSummary.of(
-        {
-            "run": None if run is None else str(run.path),
-            "object": config.object,
-            "judge": config.judge,
-            "policy": config.policy_name,
-            "command_line": config.command_line(),
-            "objective": name_objective(problem.task, objective),
-            "warnings": [*warnings, *_remarks(findings, problem, journal)],
-            "drive": drive,
-            "shared": SharedWork.of_facts(journal.traced.facts, journal.machines),
-            "seconds": {**stages.seconds, "total": stages.total},
-            **_asked(problem),
-            **_seen(problem, findings, clean, adversarial),
-            "printability": _printability(problem, findings) if config.printable else None,
-        }
+    task, depth = problem.task, problem.renderer.scene.max_depth
+    controls = problem.searched_space.controls
+    verification = findings.verification
+    history = [] if search is None else search.history
+    path = None if run is None else run.path
+    summary = AttackSummary(
+        run=None if path is None else str(path),
+        object=config.object,
+        judge=config.judge,
+        model=problem.model.name,
+        task=task.title,
+        environment=problem.environment,
+        controls=[bound.name for bound in controls],
+        policy=config.policy_name,
+        objective=name_objective(task, objective),
+        epsilon=_alone({bound.name: bound.budget.epsilon for bound in controls}),
+        norm=_alone({bound.name: bound.budget.norm for bound in controls}),
+        label_set=list(task.truth_names(problem.truth())),
+        goal=task.goal,
+        target=list(task.target_names) or None,
+        over=[bound.name for bound in problem.space.controls[len(controls) :]],
+        conditions=_conditions(problem),
+        image_formation=Formation.of(problem.renderer.formation),
+        gradient_plan=problem.plan_summary(problem.plan),
+        light_path_segments=PathSegments(search=problem.search_depth or depth, verification=depth),
+        ending=_ending(problem, findings).value,
+        clean=_clean_prediction(problem, findings, clean),
+        adversarial=None if search is None else _prediction(adversarial.judgement, adversarial.trial),
+        verified=verification and verified_rate(verification),
+        tried_objective=TriedObjective(
+            clean=_objective_over(findings.clean),
+            answer=_objective_over(verification.adversarial_trials if verification else ()),
+        ),
+        baseline=_baseline(problem, findings),
+        answer_from="random" if findings.beaten is not None else None,
+        policy_verified=findings.beaten and verified_rate(findings.beaten),
+        drive=drive,
+        ambient=_ambient_light(findings),
+        average=_average_case(findings),
+        smallest=_smallest_epsilon(problem, findings),
+        printability=_printability(problem, findings) if config.printable else None,
+        distribution=None if search is None else _distribution(problem, search),
+        failures=described_failures(problem, findings),
+        sample_count=findings.sample_count and VerificationSamples.of(findings.sample_count),
+        transport=findings.transport_summary,
+        claimed=None if search is None else _claim(search),
+        gradients=None if search is None else _gradients(search),
+        configuration=None if search is None else _found_values(problem, search.best_u),
+        shared=SharedWork.of_facts(journal.traced.facts, journal.machines),
+        renders=_renders(findings, problem),
+        steps=len(history),
+        non_finite=NotFinite(
+            objectives=0 if search is None else search.non_finite_objectives,
+            gradient_elements=0 if search is None else search.non_finite_elements,
+        ),
+        warnings=[*warnings, *_remarks(findings, problem, journal)],
+        seconds={**stages.seconds, "total": stages.total},
+        seed=problem.seed,
+        command_line=config.command_line(path),
+        python_only=config.python_only,
     )
     if run is not None:
         keep_result(run, summary)
         if not findings.interrupted:
             run.store.forget()
-    path = None if run is None else run.path
     return AttackResult(
         summary, path, u, clean.picture, adversarial.picture, artifacts, search, in_memory=tuple(journal.rows)
     )
-
-
-# ---- the summary, whose fields are attributes of what was found, where both have one name ---------------------------
-
-
-def _asked(problem: Problem) -> dict[str, object]:
-    task, controls, depth = problem.task, problem.searched_space.controls, problem.renderer.scene.max_depth
-    return {
-        "model": problem.model.name,
-        "task": task.title,
-        "environment": problem.environment,
-        "controls": [bound.name for bound in controls],
-        "epsilon": _alone({bound.name: bound.budget.epsilon for bound in controls}),
-        "norm": _alone({bound.name: bound.budget.norm for bound in controls}),
-        "label_set": list(task.truth_names(problem.truth())),
-        "goal": task.goal,
-        "target": list(task.target_names) or None,
-        "over": [bound.name for bound in problem.space.controls[len(controls) :]],
-        "conditions": _conditions(problem),
-        "image_formation": problem.renderer.formation,
-        "gradient_plan": problem.plan_summary(problem.plan),
-        "light_path_segments": {"search": problem.search_depth or depth, "verification": depth},
-        "seed": problem.seed,
-    }
 
 
 def _alone(values: dict[str, T]) -> T | dict[str, T]:
     return next(iter(values.values())) if len(values) == 1 else values
 
 
-def _seen(problem: Problem, findings: Findings, clean: KeptPicture, adversarial: KeptPicture) -> dict[str, object]:
-    baseline, checked, bracket = findings.baseline, findings.verification, findings.smallest
-    ending = Ending.INTERRUPTED
-    if not findings.interrupted and checked is not None:
-        ending = checked.ending
-    elif not findings.interrupted and findings.clean:
-        if problem.rule.already_wrong(count_right(findings.clean, findings.spp)):
-            ending = Ending.ALREADY_WRONG
-    seen: dict[str, object] = {
-        "ending": ending.value,
-        "clean": {
-            **_prediction(clean.judgement, clean.trial),
-            "correct": clean.judgement.right,
-            "moved": problem.space.moved,
-            "control": control_group(findings.clean, findings.spp) if findings.clean else None,
-        },
-        "verified": checked and verified_rate(checked),
-        "tried_objective": {
-            "clean": _objective_over(findings.clean),
-            "answer": _objective_over(checked.adversarial_trials if checked else ()),
-        },
-        "answer_from": "random" if findings.beaten is not None else None,
-        "policy_verified": findings.beaten and verified_rate(findings.beaten),
-        "failures": described_failures(problem, findings),
-        "transport": findings.transport_summary,
-        "sample_count": findings.sample_count,
-        "renders": _renders(findings, problem),
-        **_searched(problem, findings.search, adversarial),
-    }
-    if baseline is not None:
-        rate = findings.baseline_verification and verified_rate(findings.baseline_verification)
-        seen["baseline"] = {"policy": "random", "renders": baseline.renders * problem.draws, "verified": rate}
-    if findings.ambient:
-        points: list[dict[str, Any]] = [
-            {"lux": lux, "holds": tried.ending is Ending.FOUND, "verified": verified_rate(tried)}
-            for lux, tried in sorted(findings.ambient.items())
-        ]
-        ends = next((number for number, point in enumerate(points) if not point["holds"]), len(points))
-        ends_at = points[ends]["lux"] if ends < len(points) else None
-        holds_to = points[ends - 1]["lux"]
-        seen["ambient"] = {"lux": points[0]["lux"], "holds_to": holds_to, "ends_at": ends_at, "points": points}
-    if findings.average:
-        inside = [trial for trial in findings.average if trial.prediction.label != OUT_OF_VIEW] or findings.average
-        counted, scores = count_right(inside, findings.spp), [trial.score for trial in inside]
-        seen["average"] = {
-            "configurations": counted.trials,
-            "correct": counted.successes,
-            "accuracy": counted.rate,
-            "interval": counted.interval,
-            "margin": 0.0 - mean_number(scores),
-            "worst_margin": 0.0 - max((score for score in scores if score == score), default=math.nan),
-        }
-    if bracket is not None:
-        of = {bound.name: float(bound.budget.epsilon or 0.0) for bound in problem.searched_space.controls}
-        low, high = ({name: times * epsilon for name, epsilon in of.items()} for times in (bracket.low, bracket.high))
-        seen["smallest"] = {
-            "epsilon": None if bracket.u is None else high,
-            "not_found_at": low if bracket.low else None,
-            **{name: getattr(bracket, name) for name in ("closed", "confirmed", "searches", "checks")},
-        }
-    return seen
+def _ending(problem: Problem, findings: Findings) -> Ending:
+    if findings.interrupted:
+        return Ending.INTERRUPTED
+    if findings.verification is not None:
+        return findings.verification.ending
+    if findings.clean and problem.rule.already_wrong(count_right(findings.clean, findings.spp)):
+        return Ending.ALREADY_WRONG
+    return Ending.INTERRUPTED
 
 
-def _searched(problem: Problem, search: SearchResult | None, adversarial: KeptPicture) -> dict[str, object]:
-    if search is None:
-        return {"adversarial": None, "steps": 0, "non_finite": {"objectives": 0, "gradient_elements": 0}}
+def _prediction(judgement: Judgement, trial: int | None) -> PicturedPrediction:
+    said = judgement.prediction
+    return PicturedPrediction(
+        label=said.label, index=said.index, probability=said.probability, payload=judgement.payload, trial=trial
+    )
+
+
+def _clean_prediction(problem: Problem, findings: Findings, picture: KeptPicture) -> CleanPrediction:
+    return CleanPrediction(
+        **vars(_prediction(picture.judgement, picture.trial)),
+        correct=picture.judgement.right,
+        moved=[MovedValue.of(value) for value in problem.space.moved],
+        control=control_group(findings.clean, findings.spp) if findings.clean else None,
+    )
+
+
+def _baseline(problem: Problem, findings: Findings) -> BaselineSearch | None:
+    if findings.baseline is None:
+        return None
+    verified = findings.baseline_verification and verified_rate(findings.baseline_verification)
+    return BaselineSearch(policy="random", renders=findings.baseline.renders * problem.draws, verified=verified)
+
+
+def _ambient_light(findings: Findings) -> AmbientLight | None:
+    if not findings.ambient:
+        return None
+    points = [
+        AmbientPoint(lux=lux, holds=tried.ending is Ending.FOUND, verified=verified_rate(tried))
+        for lux, tried in sorted(findings.ambient.items())
+    ]
+    n_holding = next((number for number, point in enumerate(points) if not point.holds), len(points))
+    return AmbientLight(
+        lux=points[0].lux,
+        holds_to=points[n_holding - 1].lux,
+        ends_at=points[n_holding].lux if n_holding < len(points) else None,
+        points=points,
+    )
+
+
+def _average_case(findings: Findings) -> AverageCase | None:
+    if not findings.average:
+        return None
+    visible = [trial for trial in findings.average if trial.prediction.label != OUT_OF_VIEW] or findings.average
+    right = count_right(visible, findings.spp)
+    scores = [trial.score for trial in visible]
+    return AverageCase(
+        configurations=right.trials,
+        correct=right.successes,
+        accuracy=right.rate,
+        interval=right.interval,
+        margin=0.0 - mean_number(scores),
+        worst_margin=0.0 - max((score for score in scores if score == score), default=math.nan),
+    )
+
+
+def _smallest_epsilon(problem: Problem, findings: Findings) -> SmallestEpsilon | None:
+    bracket = findings.smallest
+    if bracket is None:
+        return None
+    budgets = {bound.name: float(bound.budget.epsilon or 0.0) for bound in problem.searched_space.controls}
+    return SmallestEpsilon(
+        epsilon=None if bracket.u is None else {name: bracket.high * budget for name, budget in budgets.items()},
+        not_found_at={name: bracket.low * budget for name, budget in budgets.items()} if bracket.low else None,
+        closed=bracket.closed,
+        confirmed=bracket.confirmed,
+        searches=bracket.searches,
+        checks=bracket.checks,
+    )
+
+
+def _claim(search: SearchResult) -> SearchClaim:
+    return SearchClaim(
+        objective=search.claimed_objective, re_evaluated=search.best_objective, success_rate=search.success_rate
+    )
+
+
+def _gradients(search: SearchResult) -> SearchGradients:
     norms = [record.gradient_norm for record in search.history if record.objective == record.objective]
-    searched: dict[str, object] = {
-        "adversarial": _prediction(adversarial.judgement, adversarial.trial),
-        "configuration": _found_values(problem, search.best_u),
-        "claimed": {
-            "objective": search.claimed_objective,
-            "re_evaluated": search.best_objective,
-            "success_rate": search.success_rate,
-        },
-        "steps": len(search.history),
-        "gradients": {
-            "count": search.gradients,
-            "cosine_with_the_one_before": statistics.median(search.agreement) if search.agreement else None,
-            "zero": sum(norm == 0.0 for norm in norms),
-            **vars(search.counts),
-        },
-        "non_finite": {
-            "objectives": search.non_finite_objectives,
-            "gradient_elements": search.non_finite_elements,
-        },
-    }
-    if (distribution := search.distribution) is not None and distribution.mean.numel() <= MOST_NUMBERS:
-        middle = problem.describe(problem.domain.project(distribution.mean))
-        searched["distribution"] = {"mean": middle, "deviation": distribution.deviation.tolist()}
-    return searched
+    return SearchGradients(
+        count=search.gradients,
+        cosine_with_the_one_before=statistics.median(search.agreement) if search.agreement else None,
+        zero=sum(norm == 0.0 for norm in norms),
+        cut=search.counts.cut,
+        shortened=search.counts.shortened,
+        rejected=search.counts.rejected,
+    )
+
+
+def _distribution(problem: Problem, search: SearchResult) -> SearchDistribution | None:
+    distribution = search.distribution
+    if distribution is None or distribution.mean.numel() > MOST_NUMBERS:
+        return None
+    middle = problem.describe(problem.domain.project(distribution.mean))
+    return SearchDistribution(
+        mean={name: DescribedValue.of(value) for name, value in middle.items()},
+        deviation=distribution.deviation.tolist(),
+    )
 
 
 def name_objective(task: Task, objective: str | None) -> str:
@@ -220,56 +286,58 @@ def name_objective(task: Task, objective: str | None) -> str:
     return named
 
 
-def _objective_over(trials: Sequence[Judgement]) -> dict[str, float] | None:
+def _objective_over(trials: Sequence[Judgement]) -> ObjectiveValues | None:
     """Return mean, deviation and range of the objective over trials; None where there are none."""
     values = [trial.objective for trial in trials if trial.objective is not None]
     if not values:
         return None
     spread = statistics.pstdev(values) if all(map(math.isfinite, values)) else math.nan
-    return {"mean": mean(values), "deviation": spread, "low": min(values), "high": max(values)}
+    return ObjectiveValues(mean=mean(values), deviation=spread, low=min(values), high=max(values))
 
 
-def _printability(problem: Problem, findings: Findings) -> dict[str, object]:
-    at = {"clean": problem.domain.start}
-    for name, search in (("with", findings.search), ("without", findings.unprinted)):
-        if search is not None:
-            at[name] = problem.domain.project(search.best_u)
-    terms = {name: print_terms(problem.searched_space, u) for name, u in at.items()}
-    cost, verified, other = None, findings.verification, findings.unprinted_verification
-    if verified is not None and other is not None and findings.unprinted is not None:
-        rate, unprinted = verified_rate(verified), verified_rate(other)
-        cost = {
-            "steps": len(findings.unprinted.history),
-            "margin_with": rate.margin,
-            "margin_without": unprinted.margin,
-            "cost": rate.margin - unprinted.margin,
-            "verified": unprinted,
-            "terms": terms["without"],
-        }
-    return {"clean": terms["clean"], "answer": terms.get("with"), "cost": cost}
+def _printability(problem: Problem, findings: Findings) -> Printability:
+    def terms_of(search: SearchResult | None) -> PrintTerms | None:
+        if search is None:
+            return None
+        return print_terms(problem.searched_space, problem.domain.project(search.best_u))
+
+    verified, unprinted_verified = findings.verification, findings.unprinted_verification
+    cost, unprinted_terms = None, terms_of(findings.unprinted)
+    if verified and unprinted_verified and findings.unprinted and unprinted_terms:
+        margin, unprinted = verified_rate(verified).margin, verified_rate(unprinted_verified)
+        cost = PrintCost(
+            steps=len(findings.unprinted.history),
+            margin_with=margin,
+            margin_without=unprinted.margin,
+            cost=margin - unprinted.margin,
+            verified=unprinted,
+            terms=unprinted_terms,
+        )
+    clean = print_terms(problem.searched_space, problem.domain.start)
+    return Printability(clean=clean, answer=terms_of(findings.search), cost=cost)
 
 
-def _prediction(judgement: Judgement, trial: int | None) -> dict[str, Any]:
-    return {**vars(judgement.prediction), "payload": judgement.payload, "trial": trial}
-
-
-def _found_values(problem: Problem, u: Tensor) -> dict[str, dict[str, object]]:
-    """The adversarial configuration, each value beside the clean one and, of a single number, the ends of its range."""
+def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
+    """Return the adversarial configuration, with the clean value and, of a single number, the bounds of its range."""
     start = problem.domain.start
     single = {group.name: group.begin for group in problem.space.groups if group.size == 1 and group.begin < len(start)}
-    ends = []
-    for end in (0.0, 1.0):
+    bounds = []
+    for bound in (0.0, 1.0):
         moved = start.clone()
-        moved[[*single.values()]] = end
-        ends.append(problem.describe(moved))
-    clean, values = problem.describe(start), dict[str, dict[str, object]]()
+        moved[[*single.values()]] = bound
+        bounds.append(problem.describe(moved))
+    clean_values, values = problem.describe(start), dict[str, FoundValue]()
     for name, described in problem.describe(problem.domain.project(u)).items():
-        values[name] = {**described}
-        if name in clean and isinstance(clean[name]["value"], (int, float, str)):
-            values[name]["clean"] = clean[name]["value"]
-        low, high = (at[name]["value"] if name in at else None for at in ends)
-        if name in single and isinstance(low, float) and isinstance(high, float) and low < high:
-            values[name] |= {"low": low, "high": high}
+        clean = clean_values[name]["value"] if name in clean_values else None
+        low, high = (at_bound[name]["value"] if name in at_bound else None for at_bound in bounds)
+        has_range = name in single and isinstance(low, float) and isinstance(high, float) and low < high
+        values[name] = FoundValue(
+            value=described["value"],
+            unit=described["unit"],
+            clean=clean if isinstance(clean, (int, float, str)) else None,
+            low=low if has_range else None,
+            high=high if has_range else None,
+        )
     return values
 
 
@@ -342,34 +410,44 @@ def described_failures(problem: Problem, findings: Findings) -> DifferentFailure
         return None
     listed = []
     for number, failure in enumerate(known.listed):
-        ranges: dict[str, object] = {}  # both ends in the parameter's unit, else in u; of a choice its option
-        for place, ends in failure.ranges.items():
-            block, values = problem.domain.block_of(place), list[Any]()
-            for end in ends:
-                moved = failure.u.clone()
-                moved[place] = failure.u[place] if block.options else end
-                value = problem.describe(moved).get(block.name)
-                values.append(end if value is None else value["value"])
-            options = [value for value in values if isinstance(value, str)]
-            numbers = values if block.size == 1 else ends
-            ranges[problem.domain.names[place]] = options[0] if options else (min(numbers), max(numbers))
-        described = {"ranges": ranges, "configuration": problem.describe(failure.u), "objective": failure.objective}
-        described |= {"holds": None, "verified": None, "picture": None}
-        if number < len(findings.failures):
-            checked = findings.failures[number]
-            described |= {"holds": checked.ending is Ending.FOUND, "verified": verified_rate(checked)}
-            described |= {"picture": f"images/{_picture(number)}.png"}
-            described |= {"pictured": _prediction(checked.adversarial_trials[0], 0)}
+        checked = findings.failures[number] if number < len(findings.failures) else None
+        configuration = problem.describe(failure.u)
+        described = DifferentFailure(
+            ranges=_ranges_of(problem, failure),
+            configuration={name: DescribedValue.of(value) for name, value in configuration.items()},
+            objective=failure.objective,
+            holds=None if checked is None else checked.ending is Ending.FOUND,
+            verified=checked and verified_rate(checked),
+            picture=None if checked is None else f"images/{_picture(number)}.png",
+            pictured=checked and _prediction(checked.adversarial_trials[0], 0),
+        )
         listed.append(described)
-    return DifferentFailures.of(
-        {
-            **vars(known),
-            "over": [problem.domain.names[place] for place in known.over],
-            "tried": len(findings.failures),
-            "held": sum(checked.ending is Ending.FOUND for checked in findings.failures),
-            "listed": listed,
-        }
+    return DifferentFailures(
+        over=[problem.domain.names[place] for place in known.over],
+        found=known.found,
+        seen=known.seen,
+        places=known.places,
+        share=known.share and FailingShare.of(known.share),
+        tried=len(findings.failures),
+        held=sum(checked.ending is Ending.FOUND for checked in findings.failures),
+        listed=listed,
     )
+
+
+def _ranges_of(problem: Problem, failure: FoundFailure) -> dict[str, tuple[float, float] | str]:
+    """Return the ranges of a failure: in the parameter's unit, else in u; of a discrete choice its option."""
+    ranges: dict[str, tuple[float, float] | str] = {}
+    for place, ends in failure.ranges.items():
+        block, values = problem.domain.block_of(place), list[Any]()
+        for end in ends:
+            moved = failure.u.clone()
+            moved[place] = failure.u[place] if block.options else end
+            value = problem.describe(moved).get(block.name)
+            values.append(end if value is None else value["value"])
+        options = [value for value in values if isinstance(value, str)]
+        numbers = values if block.size == 1 else ends
+        ranges[problem.domain.names[place]] = options[0] if options else (min(numbers), max(numbers))
+    return ranges
 
 
 def _picture(number: int) -> str:

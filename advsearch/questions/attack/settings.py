@@ -115,7 +115,6 @@ class AttackConfig(DerivativeConfig):
     metrics: dict[str, str] = setting(
         dict, "run", "your own numbers for every picture, each a column of the rows; may be repeated",
         "NAME=package.module:function of image, output and truth", flag="--metric", metavar="NAME=FUNCTION",
-        form="assignments",
     )
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
         None, "run", "experiment tracker to which every evaluation is sent; its package has to be installed",

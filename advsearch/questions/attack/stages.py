@@ -33,7 +33,7 @@ from advsearch.engine import surface_light
 from advsearch.engine.bank import Bank
 from advsearch.engine.gradients import planning
 from advsearch.engine.gradients.bench import Bench, interior_point
-from advsearch.engine.journal import PLAN, Journal, finite, other_numbers, same
+from advsearch.engine.journal import PLAN, Journal
 from advsearch.engine.judging import penalised
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings
@@ -47,12 +47,10 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.wording import count
 from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.transport.matrix import TransportTooLargeError
-from advsearch.tasks import Judgement
 
 MOST_FRAMES = 60
 UNPRINTED = "search without print terms"
 """The kind of the search beside one with print terms: what these cost is told by its result."""
-LOOK, LOOKED_AT = "first look", ("score", "margin", "objective")
 """The note of what the model and the objective said of the first look, and of what it consists for each picture."""
 FIRST_LOOK = 4
 """Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
@@ -154,20 +152,6 @@ class Attack:
             return evaluation
 
         findings.first_look = run_trials(partial(map, look), start, spp=spp, seed=seed, trials=FIRST_LOOK)
-
-        def values(trial: Judgement) -> list[float | None]:
-            return [finite(getattr(trial, name)) for name in LOOKED_AT]
-
-        # a model or an objective that says something else of the same pictures now is refused; one that does so each
-        # time can't be told by it
-        now, before = list(map(values, findings.first_look)), self.journal.note(LOOK)
-        if before is None:
-            self.journal.set_note(LOOK, now)
-        elif not all(map(same, before, now)):
-            again = problem.evaluate(Query(start, seeds.stream(seed, "verification", 0), spp=spp))
-            if same(values(again.said), now[0]):
-                both = zip(before[0], now[0], strict=True)
-                raise other_numbers(self.journal.run, dict(zip(LOOKED_AT, both, strict=True)))
         looks_right = any(trial.right for trial in findings.first_look)
         if not problem.rule.control or (looks_right and not config.smallest):
             return True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePath
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, JsonValue, field_validator
 
@@ -25,7 +25,6 @@ from advsearch.extend import (
 
 Cell = str | int | float | None
 
-ALL_OBJECTS = "*"  # under this a label stands that is right for every object without one of its own
 NAMED = "what the recipe names"
 
 
@@ -76,7 +75,7 @@ class RecipeConfig(Config):
         dict, "model",
         "the right labels, separated by commas, for all objects or one (OBJECT=LABELS); may be repeated",
         'names of classes, such as "coffee mug,cup" or mug="coffee mug,cup"',
-        form="choices", metavar="LABELS", otherwise="each object's own",
+        read_texts=settings.parse_choices, metavar="LABELS", otherwise="each object's own",
     )
     seed: int = setting_as_in(SceneConfig, "seed")
     threads: int | None = setting_as_in(SceneConfig, "threads")
@@ -101,11 +100,6 @@ class RecipeConfig(Config):
         """A run is gone on with from any folder."""
         return None if value is None else str(Path(value).expanduser().resolve())
 
-    @field_validator("label", mode="before")
-    @classmethod
-    def _label_for_all(cls, value: Any) -> Any:
-        return {ALL_OBJECTS: value} if isinstance(value, str) else value
-
     @field_validator("label")
     @classmethod
     def _labels_with_names(cls, value: dict[str, str]) -> dict[str, str]:
@@ -124,7 +118,7 @@ class RecipeConfig(Config):
 
     def label_of(self, name: str) -> str | None:
         """Return what was said to be the right label for an object; None for its own."""
-        return self.label.get(name) or self.label.get(Path(name).stem) or self.label.get(ALL_OBJECTS)
+        return self.label.get(name) or self.label.get(Path(name).stem) or self.label.get(settings.FOR_ALL)
 
 
 SHARES = ("share", "low", "high")  # columns of a figure's numbers that are a share and the ends of its 95 % interval

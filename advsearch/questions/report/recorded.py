@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -177,15 +177,8 @@ def made_with(folder: Path, read: Sequence[Path]) -> dict[str, str]:
     several that differ, all."""
     found = dict[str, dict[str, None]]()
     parts = [part for part in sorted((folder / PARTS).glob("*")) if is_run(part)]
-    for sitting in _sittings([folder, *parts, *read]):
-        for name, text in sitting.items():
+    for run in [folder, *parts, *read]:
+        facts = noted(run, MADE_WITH)
+        for name, text in facts.items() if isinstance(facts, Mapping) else ():
             found.setdefault(str(name), {})[str(text)] = None
     return {name: ", then ".join(texts) for name, texts in found.items()}
-
-
-def _sittings(folders: Sequence[Path]) -> Iterator[Mapping[str, object]]:
-    for folder in folders:
-        sittings = noted(folder, MADE_WITH)
-        for sitting in sittings if isinstance(sittings, list) else []:
-            if isinstance(sitting, Mapping):
-                yield sitting

@@ -37,10 +37,10 @@ class StabilityConfig(Config):
     clashes: ClassVar[tuple[Clash, ...]] = tuple(clash for clash in SceneConfig.clashes if clash.setting == "overwrite")
 
     case: str | None = setting(
-        None, "check", "cases to try, separated by commas", "names of cases", otherwise="all", form="names"
+        None, "check", "cases to try, separated by commas", "names of cases", otherwise="all", repeats=True
     )
     group: str | None = setting(
-        None, "check", "groups of cases to try, separated by commas", "names of groups", otherwise="all", form="names"
+        None, "check", "groups of cases to try, separated by commas", "names of groups", otherwise="all", repeats=True
     )
     seconds: float | None = setting(
         None, "check",
@@ -122,7 +122,7 @@ class StabilityResult(InNotebook, results.Result):
     seconds: Annotated[dict[str, results.JsonFloat], results.having("total")] = Field(
         description="in `total`, of this sitting"
     )
-    command_line: str = Field(description="that asks the same again")
+    command_line: str | None = Field(description="that asks the same again")
 
     @property
     def brief(self) -> str:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from advsearch.attacks.domain import batches
 from advsearch.cluster import InProcess, Workers
-from advsearch.engine.journal import Journal, Sent, Shared, finite, lost, other_numbers, same, worker_call
+from advsearch.engine.journal import Journal, Sent, Shared, lost, worker_call
 from advsearch.engine.loading import framed
 from advsearch.engine.record import LOST, judgement_of, lost_remarks
 from advsearch.interrupts import interruptible
@@ -78,7 +78,6 @@ class Sweep:
     def carry_out(self, first: int | None = None) -> SweepResult:
         """Do what is left, or all from the configuration with a number on, and return the result."""
         predictions, ending = self._counted(), FINISHED
-        self._check_numbers()
         for text in self.job.warnings:
             self.stages.progress.message(text)
         try:
@@ -155,21 +154,6 @@ class Sweep:
                     asked = self.job.queries(range(before + piece.start, before + piece.stop))
                     yield [one for one in asked if part.start <= one[2].number < part.stop]
                 first = before + self.per_scene
-
-    def _check_numbers(self) -> None:
-        """Look again at the first picture that is stored, where there is more to come here."""
-        row = None if self.run is None else next(self.run.store.rows(KIND), None)
-        if row is None or self.run is None or self._executor.facts is not None or not any(map(len, self._left())):
-            return
-        number, model = divmod(row.step, self.models)
-        other, queries = OpenScenes(self.job).asked(number)  # what is done here decides no row
-
-        def look() -> float | None:
-            return finite(other.evaluate_all(queries)[model].said.margin)
-
-        now = look()
-        if not same([row.margin], [now]) and same([now], [look()]):
-            raise other_numbers(self.run, {"margin": (row.margin, now)})
 
     def _tell(self, count: int, predictions: Predictions) -> None:
         self._untold += count
@@ -313,7 +297,8 @@ class Sweep:
             seconds={**seconds, "total": self.stages.total},
             seed=job.config.seed,
             warnings=[*job.warnings, *self._remarks(predictions, checked, changes)],
-            command_line=job.config.command_line(),
+            command_line=job.config.command_line(None if run is None else run.path),
+            python_only=job.config.python_only,
         )
         if run is not None:
             for suffix, data in sweep_figure(summary).items():

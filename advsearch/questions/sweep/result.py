@@ -327,7 +327,7 @@ def _summary_of(rows: pd.DataFrame, run: Path, folder: Path) -> SweepSummary:
         renders={"sweep": len(rows)},
         seconds={"total": 0.0},
         warnings=[f"Read from {folder}, as 3DB wrote it; it was not rendered here."],
-        command_line="",
+        command_line=None,
     )
 
 

@@ -69,7 +69,7 @@ class SweepConfig(SceneConfig):
     )
     grid: Grid = setting(
         dict, "sweep", "one axis of the grid; may be repeated",
-        "PARAMETER=FIRST:LAST:COUNT, or values separated by commas", metavar="PARAMETER=VALUES", form="axes",
+        "PARAMETER=FIRST:LAST:COUNT, or values separated by commas", metavar="PARAMETER=VALUES",
     )
     controls: ControlsByName = setting_as_in(
         SceneConfig, "controls", default=dict, group="sweep",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import secrets
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from advsearch.extend import (
     AttackConfig,
@@ -110,11 +112,13 @@ def _note_settings(context: RunContext[SuiteConfig], suite: Suite, planned: Sequ
     run.store.set_note(SUITE_NOTE, json.dumps(suite.model_dump(mode="json")))
     judged_with = {claim.name: claim.config.deciding() for claim in planned if claim.example is not None}
     run.store.set_note(SETTINGS_NOTE, json.dumps(judged_with))
+    used_settings = list[dict[str, Any]]()
     for claim in planned:
-        run.note_sitting(claim.config)
+        used_settings.append(claim.config.plain())
         tested = None if claim.example is not None else suite.claims[claim.name]
         if isinstance(tested, NoWorseClaim):
-            run.note_sitting(claim.config.model_copy(update={"model": tested.than}))
+            used_settings.append({"model": tested.than})
+    run.check_files_unchanged(used_settings)
 
 
 @dataclass
@@ -175,15 +179,22 @@ class _SuiteRun:
         )
 
     def _add(self, claim: PlannedClaim, tried: ClaimResult) -> None:
-        no = {"add": None, "run": None, "junit": None, "sarif": None, "markdown": None}
-        repeat = self._repeat(only=claim.name, update=False, overwrite=False, **no)
+        repeat = self._repeat_command(f"only={claim.name}") or ""
         expected = self.expected.get(claim.name, "held")
         self.results.append(tried.model_copy(update={"expected": expected, "repeat": repeat}))
 
-    def _repeat(self, **changes: object) -> str:
+    def _repeat_command(self, *changes: str) -> str | None:
+        """Return the command that tries the claims again with the same seed, and changes nothing but its own run."""
         config = self.trial.config
-        asked = config.model_copy(update={"seed": self.trial.suite.seed, "fresh": False, **changes})
-        return asked.with_only_here(config.only_here).command_line()
+        command = config.command_line(self.trial.run.path)
+        if command is None:
+            return None
+        defaults = {
+            power.name: power.default for power in config.powers if power.name not in type(config).place_settings
+        }
+        without = [f"{name}={json.dumps(default)}" for name, default in defaults.items()]
+        seed = ["fresh=false", f"seed={self.trial.suite.seed}"] if config.fresh else []
+        return f"{command} {shlex.join([*changes, *seed, *without])}".rstrip()
 
     def result(self, ending: str, added: Counterexample | None) -> SuiteResult:
         config, suite = self.trial.config, self.trial.suite
@@ -203,7 +214,7 @@ class _SuiteRun:
             answer=verdict(claims), confidence=suite.confidence, claims=claims, ending=ending,
             added=None if added is None else str(added.path), changes=changes,
             warnings=list(dict.fromkeys(self.trial.warnings)), seconds={"total": self.trial.passed}, seed=suite.seed,
-            command_line=self._repeat(),
+            command_line=self._repeat_command(), python_only=config.python_only,
         )  # fmt: skip
 
 

@@ -161,7 +161,7 @@ class Counterexample:
 
     def changed_file(self, config: AttackConfig) -> str | None:
         """Return the name of a file that its settings name and that is another one now; None where all are the same."""
-        return RunDirectory.find_changed_file([self.files], deciding_settings(config))
+        return RunDirectory.find_changed_file(self.files, deciding_settings(config))
 
     def configuration(self, start: Tensor) -> Tensor:
         if start.numel() != len(self.moved):

@@ -384,7 +384,7 @@ def sarif(result: SuiteResult) -> str:
             "properties": {name: value for name, value in more.items() if value},
         })  # fmt: skip
     driver = {"name": "advsearch", "version": __version__, "rules": rules}
-    invocation = {"executionSuccessful": not result.goes_on, "commandLine": result.command_line}
+    invocation = {"executionSuccessful": not result.goes_on, "commandLine": result.command_line or ""}
     run = {"tool": {"driver": driver}, "invocations": [invocation], "results": results}
     return json.dumps({"$schema": SARIF_SCHEMA, "version": "2.1.0", "runs": [run]}, indent=2, ensure_ascii=False) + "\n"
 

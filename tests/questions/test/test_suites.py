@@ -150,7 +150,7 @@ def test_the_evidence_has_a_paragraph_for_each_claim(tested: tuple[SuiteResult, 
 def test_the_command_repeats_a_claim_alone(tested: tuple[SuiteResult, Path], tmp_path: Path) -> None:
     result, _ = tested
     first = next(one for one in result.claims if one.name == "behind")
-    assert first.repeat == f"advsearch test --suite {result.suite} --only behind --seed 0"
+    assert first.repeat == f"advsearch run {result.run}/run.yaml only=behind"
     again = carry_out(SuiteConfig(suite=result.suite, only="behind", run=str(tmp_path / "run")))
     (one,) = again.claims
     assert (one.reason, one.interval) == (first.reason, first.interval), "the same pictures"
@@ -587,7 +587,7 @@ def test_the_command_writes_what_machines_read_and_its_status_is_the_result(
     cases = {one.get("name"): one for one in root.iter("testcase")}
     assert root.get("tests") == "2" and root.get("failures") == root.get("errors") == "1"
     failure = cases["behind"].find("failure")
-    assert failure is not None and "images/behind.png" in str(failure.text) and "--only behind" in str(failure.text)
+    assert failure is not None and "images/behind.png" in str(failure.text) and "only=behind" in str(failure.text)
     log = json.loads(Path("out.sarif").read_text())
     (run,) = log["runs"]
     assert log["version"] == "2.1.0" and [one["level"] for one in run["results"]] == ["error", "warning"]
@@ -597,7 +597,7 @@ def test_the_command_writes_what_machines_read_and_its_status_is_the_result(
         line = one["locations"][0]["physicalLocation"]["region"]["startLine"]
         assert Path(suite).read_text().splitlines()[line - 1].strip() == f"{one['partialFingerprints']['claim/v1']}:"
     text = Path("out.md").read_text()
-    assert "| behind | failed |" in text and "advsearch test --suite" in text
+    assert "| behind | failed |" in text and "run.yaml only=" in text
     assert main(["show", str(said["run"])]) == 0
     assert "too-few" in capsys.readouterr().out
     assert main(["test", suite, "--code", EASY, "--only", "too-few", "--quiet"]) == 2
@@ -764,7 +764,7 @@ def test_a_search_and_a_suite_can_be_asserted(tmp_path: Path, monkeypatch: pytes
     monkeypatch.chdir(tmp_path)
     assert assert_not_broken(advsearch.load_scene("mug"), always(), **SMALL, **QUICK).status == 0
     suite = written(tmp_path, {"too-few": CLAIMS["too-few"]})
-    with pytest.raises(AssertionError, match=r"too-few: undecided: .*(\n.*)*again: advsearch test"):
+    with pytest.raises(AssertionError, match=r"too-few: undecided: .*(\n.*)*again: advsearch run"):
         assert_suite(suite)
 
 
