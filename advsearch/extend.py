@@ -1,5 +1,4 @@
 """What an added experiment, control, task, policy, model source, reader or exporter may import from advsearch.
-
     from advsearch.extend import Control, Parameter, Values
 
 Everything else in the package may change without notice. The built-in parts that the core does without use this module
@@ -13,12 +12,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from advsearch import models as models
     from advsearch import seeds as seeds
     from advsearch import statistics as statistics
+    from advsearch import tasks as tasks
     from advsearch.attacks import Domain as Domain
     from advsearch.attacks import Evaluation as Evaluation
     from advsearch.attacks import Policy as Policy
     from advsearch.attacks import Proposal as Proposal
+    from advsearch.attacks import policies as policies
     from advsearch.config import SceneConfig as SceneConfig
     from advsearch.controls.base import Choice as Choice
     from advsearch.controls.base import Control as Control
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
     from advsearch.controls.ranges import Fixed as Fixed
     from advsearch.controls.ranges import OneOf as OneOf
     from advsearch.controls.ranges import Range as Range
+    from advsearch.controls.support import images as images
+    from advsearch.controls.support.picture_control import PictureControl as PictureControl
     from advsearch.engine.problem import Problem as Problem
     from advsearch.errors import FileFormatError as FileFormatError
     from advsearch.errors import InputError as InputError
@@ -37,6 +41,7 @@ if TYPE_CHECKING:
     from advsearch.experiment import experiment as experiment
     from advsearch.experiment import fail_check as fail_check
     from advsearch.models import Model as Model
+    from advsearch.options import Value as Value
     from advsearch.progress import Progress as Progress
     from advsearch.questions.attack.settings import AttackConfig as AttackConfig
     from advsearch.questions.sweep.settings import SweepConfig as SweepConfig
@@ -58,7 +63,10 @@ if TYPE_CHECKING:
     from advsearch.runs.summary import read_result as read_result
     from advsearch.scene import color as color
     from advsearch.scene import geometry as geometry
+    from advsearch.scene import parts as parts
     from advsearch.scene.description import SceneDescription as SceneDescription
+    from advsearch.scene.importing import reading as reading
+    from advsearch.scene.mitsuba_backend import mitsuba_data as mitsuba_data
     from advsearch.settings import Clash as Clash
     from advsearch.settings import Config as Config
     from advsearch.settings import setting as setting
@@ -67,16 +75,19 @@ if TYPE_CHECKING:
     from advsearch.tasks import Judgement as Judgement
     from advsearch.tasks import Prediction as Prediction
     from advsearch.tasks import Task as Task
+    from advsearch.trust import stored_files as stored_files
 
 _NAMES = {
     "advsearch.attacks": ("Domain", "Evaluation", "Policy", "Proposal"),
     "advsearch.config": ("SceneConfig",),
     "advsearch.controls.base": ("Choice", "Control", "Parameter", "Values"),
     "advsearch.controls.ranges": ("Fixed", "OneOf", "Range"),
+    "advsearch.controls.support.picture_control": ("PictureControl",),
     "advsearch.engine.problem": ("Problem",),
     "advsearch.errors": ("FileFormatError", "InputError", "ModelError", "UnknownNameError"),
     "advsearch.experiment": ("PositionalArgument", "RunContext", "experiment", "fail_check"),
     "advsearch.models": ("Model",),
+    "advsearch.options": ("Value",),
     "advsearch.progress": ("Progress",),
     "advsearch.questions.attack.settings": ("AttackConfig",),
     "advsearch.questions.sweep.settings": ("SweepConfig",),
@@ -96,8 +107,16 @@ _MODULES = {
     "color": "advsearch.scene.color",
     "figures": "advsearch.report.figures",
     "geometry": "advsearch.scene.geometry",
+    "images": "advsearch.controls.support.images",
+    "mitsuba_data": "advsearch.scene.mitsuba_backend.mitsuba_data",
+    "models": "advsearch.models",
+    "parts": "advsearch.scene.parts",
+    "policies": "advsearch.attacks.policies",
+    "reading": "advsearch.scene.importing.reading",
     "seeds": "advsearch.seeds",
     "statistics": "advsearch.statistics",
+    "stored_files": "advsearch.trust.stored_files",
+    "tasks": "advsearch.tasks",
     "wording": "advsearch.report.wording",
 }
 """Modules of functions that belong to the interface as a whole."""

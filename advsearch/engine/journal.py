@@ -28,8 +28,7 @@ from advsearch.cluster import Call, Workers, WorkerStats
 from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import LOST, judged, judgement_of, trial_row
 from advsearch.errors import ClusterError, InputError
-from advsearch.models import Model
-from advsearch.models.address import AskedModel
+from advsearch.models import Model, RemoteNetwork
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.formation import levels_of
@@ -130,7 +129,7 @@ def check_made_of(
     now: dict[str, Any] = {}
     for model in models:
         for network in model.module.models if isinstance(model.module, Ensemble) else (model,):
-            if isinstance(network.module, AskedModel):
+            if isinstance(network.module, RemoteNetwork):
                 network.module.keep_in(run.store)
             now[f"model {network.name}"] = {"weights": weights_digest(network)}
     now |= {name: _function(function) for name, function in (functions or {}).items() if function is not None}

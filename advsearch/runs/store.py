@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import TracebackType
-from typing import Any, final, get_args, get_type_hints
+from typing import Any, ClassVar, final, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +92,8 @@ _INSERT_TOLD = "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations
 class Store:
     """The open `results.sqlite` of a run; `read_only` beside a process that writes. Close it, or use it in a `with`
     block."""
+
+    FILE: ClassVar[str] = NAME  # in the directory of a run
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+
+from advsearch.scene.settings import CHANNELS as CHANNELS
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -31,3 +34,10 @@ def linear_to_srgb(linear: Values) -> Values:
     if isinstance(linear, np.ndarray):
         return np.where(low_end, low, curve).astype(np.float32)
     return low.where(low_end, curve)
+
+
+def combine_channels(values: Mapping[str, Tensor]) -> Tensor:
+    """Return the linear color (3,) of the display-referred numbers red, green and blue; differentiable."""
+    import torch  # whoever has tensors has it already
+
+    return srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))

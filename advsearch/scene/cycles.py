@@ -29,9 +29,9 @@ from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import glb
 from advsearch.scene.grounds import paved
-from advsearch.scene.importing.blender import command, last_line
+from advsearch.scene.importing.files import last_line
 from advsearch.scene.parts import BallLamp, MeshPart, PointLamp
-from advsearch.trust.programs import surroundings
+from advsearch.trust.programs import find_blender, surroundings
 from advsearch.trust.stored_files import scaled
 
 LONGEST = 300  # seconds that one picture may take, the start included, before `scaled`
@@ -132,7 +132,7 @@ class Cycles:
 
     def __init__(self, description: SceneDescription, size: tuple[int, int], *, max_depth: int, denoise: bool) -> None:
         try:
-            self._command = command("Blender's Cycles has to render it", "leave `ways=blender` out")
+            self._command = find_blender("Blender's Cycles has to render it", "leave `ways=blender` out")
         except FileFormatError as error:
             raise BlenderError(str(error)) from None
         unknown = [part.name for part in description.parts if not isinstance(part, (MeshPart, PointLamp, BallLamp))]

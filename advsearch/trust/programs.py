@@ -2,13 +2,16 @@
 
 The threat: a file makes a program hang, wait for somebody to type, or find settings and modules of the user's.
 
-Used for OpenUSD (`scene/importing/usd.py`) and Blender (`scene/importing/blender.py`).
+Used for OpenUSD (`scene/importing/usd`) and Blender (`scene/importing/blender.py`).
 """
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import shutil
 import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -37,3 +40,26 @@ def surroundings(folder: str) -> dict[str, str]:
     """Return the environment of a process that has a folder for its home, and nothing of ours but the path."""
     kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
     return {**kept, "HOME": folder, "TMPDIR": folder}
+
+
+BLENDER = "ADVSEARCH_BLENDER"
+"""Variable of the environment: a Blender, or a Python that has `bpy`, in the place of those that are looked for."""
+
+
+def find_blender(who: str, otherwise: str) -> list[str]:
+    """Return the program that is given a script behind it, with what makes it run that and nothing else. Raises
+    FileFormatError, for which it is told who needs it, and what else can be done: there is none."""
+    program = os.environ.get(BLENDER) or shutil.which("blender")
+    if program is None and importlib.util.find_spec("bpy") is not None:
+        program = sys.executable
+    runs = shutil.which(program or "")
+    if runs is None:
+        missing = "none is installed" if program is None else f"{BLENDER} names {program}, which can't be run"
+        raise FileFormatError(
+            f"{who}, and {missing}; install Blender so that `blender` is found, or type "
+            f"`python3.11 -m venv bpy && bpy/bin/pip install bpy` and set {BLENDER}=bpy/bin/python; or {otherwise}"
+        )
+    program = os.path.abspath(runs)
+    if Path(program).name.startswith("python"):
+        return [program, "-I"]
+    return [program, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1", "--python"]

@@ -21,9 +21,9 @@ import advsearch
 from advsearch.scene import cycles
 from advsearch.scene.cycles import BlenderError, Cycles
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.importing.blender import PROGRAM
 from advsearch.scene.parts import HazePart
 from advsearch.scene.renderer import Renderer
+from advsearch.trust.programs import BLENDER
 
 STAND_IN = f"""#!{sys.executable}
 import json, os, shutil, sys
@@ -55,7 +55,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     (tmp_path / "does.py").write_text(PAINT)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setenv("SECRET", "x")
-    monkeypatch.delenv(PROGRAM, raising=False)
+    monkeypatch.delenv(BLENDER, raising=False)
     yield tmp_path
 
 
@@ -128,6 +128,6 @@ def test_what_is_not_carried_over_is_said(
 
 
 def test_without_blender_the_command_to_type_is_said(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(PROGRAM, "nowhere/blender")
+    monkeypatch.setenv(BLENDER, "nowhere/blender")
     with pytest.raises(BlenderError, match=r"names nowhere/blender, which can't be run; .*pip install bpy"):
         by_cycles(renderer.scene.made[0])

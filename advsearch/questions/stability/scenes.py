@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import PGD, Adam, Auto, Query
-from advsearch.controls.support.meshes import sphere
 from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.record import Results, taken_rows
 from advsearch.errors import InputError, UnknownNameError
@@ -60,7 +59,7 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.library import import_environment
 from advsearch.scene.mitsuba_backend.parts import Translation, translation
-from advsearch.scene.parts import ScenePart
+from advsearch.scene.parts import ScenePart, sphere
 
 BRIGHT = 1e5
 PLATEAU_STEPS = 40  # evaluations in which a search has to be off a plateau

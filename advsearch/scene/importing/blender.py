@@ -8,20 +8,11 @@ leaves out or applies.
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import shutil
-import sys
 import tempfile
 from pathlib import Path
 
-from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import damaged, looks_like, read_bytes, shown
-from advsearch.trust.programs import run_converter, surroundings
-from advsearch.trust.stored_files import LARGEST_FILE, scaled
+from advsearch.extend import FileFormatError, reading, stored_files
 
-PROGRAM = "ADVSEARCH_BLENDER"
-"""Variable of the environment: a Blender, or a Python that has `bpy`, in the place of those that are looked for."""
 LONGEST = 120  # seconds that Blender may take, before `scaled`
 BEGINNINGS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
 """How a .blend file begins: as it is, compressed with zstd, or with gzip (before Blender 3.0)."""
@@ -49,43 +40,20 @@ def convert_blend(path: Path, data: bytes) -> bytes:
     """Return a Blender file as binary glTF. Raises FileFormatError: it is none, there is no Blender, it can't read the
     file, or it takes too long."""
     if not data.startswith(BEGINNINGS):
-        raise damaged(path, "a Blender scene", looks_like(data))
-    program = command(f"{path}: Blender has to read it", "export glTF (.glb) from Blender and name that")
+        raise reading.damaged(path, "a Blender scene", reading.looks_like(data))
+    program = reading.find_blender(f"{path}: Blender has to read it", "export glTF (.glb) from Blender and name that")
     with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
         script, target = Path(folder) / "export.py", Path(folder) / "scene.glb"
         script.write_text(EXPORT, "utf-8")
-        names = [str(path.resolve()), str(target), str(scaled(LARGEST_FILE))]
+        names = [str(path.resolve()), str(target), str(stored_files.scaled(stored_files.LARGEST_FILE))]
         started = [*program, str(script), *([] if "-I" in program else ["--"]), *names]
         try:
-            done = run_converter(path, "Blender", started, folder=folder, seconds=LONGEST, env=surroundings(folder))
+            done = reading.run_converter(
+                path, "Blender", started, folder=folder, seconds=LONGEST, env=reading.surroundings(folder)
+            )
         except OSError as error:
             raise FileFormatError(f"{path}: Blender can't be started ({error.strerror}); check {program[0]}") from error
         if done.returncode or not target.is_file():
-            last = last_line(done.stdout + done.stderr)
+            last = reading.last_line(done.stdout + done.stderr)
             raise FileFormatError(f"{path}: Blender could not read it{last}; export glTF (.glb) from it yourself")
-        return read_bytes(target, "object", (".glb",))
-
-
-def command(who: str, otherwise: str) -> list[str]:
-    """Return the program that is given a script behind it, with what makes it run that and nothing else. Raises
-    FileFormatError, for which it is told who needs it, and what else can be done: there is none."""
-    program = os.environ.get(PROGRAM) or shutil.which("blender")
-    if program is None and importlib.util.find_spec("bpy") is not None:
-        program = sys.executable
-    runs = shutil.which(program or "")
-    if runs is None:
-        missing = "none is installed" if program is None else f"{PROGRAM} names {program}, which can't be run"
-        raise FileFormatError(
-            f"{who}, and {missing}; install Blender so that `blender` is found, or type "
-            f"`python3.11 -m venv bpy && bpy/bin/pip install bpy` and set {PROGRAM}=bpy/bin/python; or {otherwise}"
-        )
-    program = os.path.abspath(runs)
-    if Path(program).name.startswith("python"):
-        return [program, "-I"]
-    return [program, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1", "--python"]
-
-
-def last_line(said: str) -> str:
-    """Return the last line of what Blender has said, for a message; empty if there is none."""
-    lines = [line for line in said.splitlines() if line.strip()]
-    return f": {shown(lines[-1].strip(), quoted=False)}" if lines else ""
+        return reading.read_bytes(target, "object", (".glb",))

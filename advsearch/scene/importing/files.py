@@ -287,3 +287,9 @@ class Notes:
             if (kind, name) not in self._taken:
                 times = "" if count == 1 else f" ({count:,} times)"
                 yield f"{self.source}: {kind} {shown(name)}{times} is left out"
+
+
+def last_line(said: str) -> str:
+    """Return the last line of what Blender has said, for a message; empty if there is none."""
+    lines = [line for line in said.splitlines() if line.strip()]
+    return f": {shown(lines[-1].strip(), quoted=False)}" if lines else ""
