@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import ast
+import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import pytest
 from test_architecture import PACKAGE, ROOT, imports, python_files
 
 from advsearch.catalog import BUILT_INS
@@ -175,6 +179,77 @@ def test_the_interface_states_each_name_once_for_editors_and_once_for_python() -
     assert for_editors == for_python
     assert len(for_python) <= 64
     assert all(getattr(extend, name) is not None for name in extend.__all__)
+
+
+USE_WITHOUT = """
+import json, os, sys
+import mitsuba, scipy.stats, torch  # once, for all children
+from advsearch.catalog import BUILT_INS, list_built_ins
+
+class Hider:
+    hidden = set()
+
+    def find_spec(self, name, path=None, target=None):
+        if any(name == module or name.startswith(module + ".") for module in self.hidden):
+            raise ModuleNotFoundError(name)
+
+sys.meta_path.insert(0, Hider())
+
+def hide(modules):
+    Hider.hidden = set(modules)
+    list_built_ins.cache_clear()
+
+def list_parts():
+    return [[part.kind, part.name] for part in BUILT_INS if part.name in list_built_ins(part.kind)]
+
+def use_parts():
+    import advsearch.cli.main
+    from advsearch.attacks.policies import POLICIES
+    from advsearch.controls import CONTROLS
+    from advsearch.models.loading import SOURCES
+    from advsearch.runs.exporters import EXPORTERS
+    from advsearch.scene.importing.readers import READERS, get_reader, list_suffixes
+    from advsearch.tasks import TASKS
+    registries = (CONTROLS, POLICIES, TASKS, SOURCES, EXPORTERS, READERS)
+    assert all(registry[name] for registry in registries for name in registry)
+    assert all(get_reader(suffix) for suffix in list_suffixes())
+
+singly, by_kind = json.loads(sys.argv[1])
+for module in singly:
+    hide([module])
+    print(json.dumps([module, list_parts()]))
+for kind, modules in by_kind.items():
+    sys.stdout.flush()
+    if os.fork():
+        assert os.wait()[1] == 0, kind
+        continue
+    hide(modules)
+    use_parts()
+    print(json.dumps([kind, list_parts()]))
+    sys.stdout.flush()
+    os._exit(0)
+"""
+
+
+@pytest.mark.slow
+def test_without_any_island_the_other_parts_are_there_and_can_be_used() -> None:
+    """Each island is hidden singly, and all of a kind together: then everything else is imported."""
+    every = [[part.kind, part.name] for part in BUILT_INS]
+    module_of = {(part.kind, part.name): part.target.partition(":")[0] for part in BUILT_INS}
+    by_kind: dict[str, set[str]] = {}
+    for part in BUILT_INS:
+        if part.name not in CORE[part.kind]:
+            by_kind.setdefault(part.kind, set()).add(module_of[part.kind, part.name])
+    asked = [sorted(set().union(*by_kind.values())), {kind: sorted(modules) for kind, modules in by_kind.items()}]
+    done = subprocess.run(
+        [sys.executable, "-c", USE_WITHOUT, json.dumps(asked)], capture_output=True, text=True, check=False, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr
+    answers = dict(json.loads(line) for line in done.stdout.splitlines())
+    for name, left in answers.items():
+        hidden = by_kind.get(name, {name})
+        assert left == [part for part in every if module_of[part[0], part[1]] not in hidden], name
+    assert set(answers) == {*asked[0], *by_kind}
 
 
 def read_documented_names(page: Path) -> set[str]:
