@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from advsearch import seeds as seeds
     from advsearch import statistics as statistics
     from advsearch import tasks as tasks
+    from advsearch.api.export import AdversarialRun as AdversarialRun
     from advsearch.attacks import Domain as Domain
     from advsearch.attacks import Evaluation as Evaluation
     from advsearch.attacks import Policy as Policy
@@ -76,8 +77,11 @@ if TYPE_CHECKING:
     from advsearch.tasks import Prediction as Prediction
     from advsearch.tasks import Task as Task
     from advsearch.trust import stored_files as stored_files
+    from advsearch.trust import writing as writing
+    from advsearch.viewer import thumbnails as thumbnails
 
 _NAMES = {
+    "advsearch.api.export": ("AdversarialRun",),
     "advsearch.attacks": ("Domain", "Evaluation", "Policy", "Proposal"),
     "advsearch.config": ("SceneConfig",),
     "advsearch.controls.base": ("Choice", "Control", "Parameter", "Values"),
@@ -117,7 +121,9 @@ _MODULES = {
     "statistics": "advsearch.statistics",
     "stored_files": "advsearch.trust.stored_files",
     "tasks": "advsearch.tasks",
+    "thumbnails": "advsearch.viewer.thumbnails",
     "wording": "advsearch.report.wording",
+    "writing": "advsearch.trust.writing",
 }
 """Modules of functions that belong to the interface as a whole."""
 

@@ -170,6 +170,7 @@ USE_PARTS = """
 import json, sys
 from pathlib import Path
 from advsearch.controls import make_control
+from advsearch.progress import NullProgress
 from advsearch.runs.exporters import EXPORTERS
 from advsearch.runs.store import Row, Store
 from advsearch.scene.importing.objects import import_object
@@ -179,7 +180,7 @@ run.mkdir()
 (run / "run.yaml").write_text("command: sweep\\n")
 with Store(run / Store.FILE) as store:
     store.append([Row("sweep", step, margin=margin) for step, margin in enumerate((0.5, -1.5))])
-exported = EXPORTERS["margins"]().write("run", Path("margins.txt"), {})
+exported = EXPORTERS["margins"]().write("run", Path("margins.txt"), {}, NullProgress())
 mesh = import_object("cube.off").mesh
 print(json.dumps([make_control("fade", {"amount": [0, 1]}).kind, exported.facts, exported.text, len(mesh.faces)]))
 try:

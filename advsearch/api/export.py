@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from torch import Tensor
 
 import advsearch
 from advsearch import seeds
-from advsearch.controls.space import file_name
+from advsearch.controls.base import file_name
 from advsearch.controls.support.images import enlarged
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.loading import Scene, as_controls, load_scene
@@ -54,6 +54,32 @@ class AdversarialRun:
     problem: Problem
     u: Tensor
 
+    @classmethod
+    def load(cls, run: str | Path) -> AdversarialRun:
+        """Load the scene of a run of `attack` that has ended, by its name or folder, and its adversarial configuration.
+
+        Raises InputError where it has none, or its scene is another one now, and FileFormatError where it did not end,
+        or is of another command.
+        """
+        folder = find_run(run)
+        summary = attack_of(folder)
+        if summary.adversarial is None:
+            raise InputError(
+                f"{folder}: ended with {summary.ending!r}, so that there is no adversarial configuration to export"
+            )
+        problem, _ = problem_from_config(judged_alone(AttackConfig.from_yaml(folder / CONFIG)))
+        trial = summary.adversarial.trial  # where conditions vary, those of the picture that the run keeps
+        draw = None if trial is None else seeds.stream(problem.seed, "verification", trial)
+        return cls(folder, problem, problem.whole(kept_configuration(folder, problem), draw))
+
+    def render(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
+        """Render the scene with some inputs, as the run does it: an image (H, W, 3) sRGB in [0, 1]."""
+        renderer = self.problem.renderer
+        traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+        with torch.no_grad():
+            rendered = renderer.rendered(traced, seed, spp, "backdrop.color" in inputs)
+            return renderer.finished(rendered, inputs, self.u)
+
     @property
     def on_picture(self) -> list[str]:
         """The controls that change the finished picture there."""
@@ -69,33 +95,17 @@ class AdversarialRun:
             return renderer.scene.assembly(renderer.space.inputs(self.u))
 
 
-def adversarial_of(run: str | Path) -> AdversarialRun:
-    """Load the scene of a run of `attack` that has ended, by its name or folder, and its adversarial configuration.
-    Raises InputError where it has none, or its scene is another one now, and FileFormatError where it did not end, or
-    is of another command."""
-    folder = find_run(run)
-    summary = attack_of(folder)
-    if summary.adversarial is None:
-        raise InputError(
-            f"{folder}: ended with {summary.ending!r}, so that there is no adversarial configuration to export"
-        )
-    problem, _ = problem_from_config(judged_alone(AttackConfig.from_yaml(folder / CONFIG)))
-    trial = summary.adversarial.trial  # where conditions vary, those of the picture that the run keeps
-    draw = None if trial is None else seeds.stream(problem.seed, "verification", trial)
-    return AdversarialRun(folder, problem, problem.whole(kept_configuration(folder, problem), draw))
-
-
 def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     """Write the adversarial scene of a run as XML with its meshes and pictures beside it, whose names begin with its
     own, to a file that ends in .xml, or a folder for `scene.xml`; return sentences about how its picture becomes that
-    of the run, and what is no part of it. Raises errors as `adversarial_of`, and InputError where such files are there,
-    or stock Mitsuba has no such scene."""
+    of the run, and what is no part of it. Raises errors as `AdversarialRun.load`, and InputError where such files are
+    there, or stock Mitsuba has no such scene."""
     path = out if out.suffix.lower() == XML else out / NAME
     taken = [path, *path.parent.glob(f"{path.stem}-*")] if path.parent.is_dir() else []
     there = [file for file in taken if os.path.lexists(file)]
     if there or path.parent.is_file() or os.path.islink(out):
         raise InputError(f"out: {(there or [path.parent])[0]} is there already; choose another name")
-    adversarial = adversarial_of(run)
+    adversarial = AdversarialRun.load(run)
     renderer, inputs = adversarial.problem.renderer, adversarial.inputs
     on_picture = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
     backdrop = on_picture.get("backdrop.color")
@@ -136,11 +146,11 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
 
 def write_gltf(run: str | Path, out: Path) -> list[str]:
     """Write the object of a run's adversarial scene as binary glTF, a file that ends in .glb: displaced and in its
-    pose, with its texture; return sentences about what is not as in the run. Raises errors as `adversarial_of`, and
-    InputError where the file is called otherwise."""
+    pose, with its texture; return sentences about what is not as in the run. Raises errors as `AdversarialRun.load`,
+    and InputError where the file is called otherwise."""
     if out.suffix.lower() != GLB:
         raise InputError(f"out: expected the name of a .glb file, got {out}")
-    adversarial = adversarial_of(run)
+    adversarial = AdversarialRun.load(run)
     description = adversarial.problem.space.scene
     assert description is not None
     part = description.meshes[OBJECT]

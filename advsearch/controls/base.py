@@ -275,6 +275,11 @@ class Control:
         """Name of the mesh that it is about: the one behind the colon of its name, or else the object."""
         return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
 
+    @property
+    def file_name(self) -> str:
+        """Its name as it stands in names of files."""
+        return file_name(self.name)
+
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
         """Return that mesh in a scene. Raises UnknownNameError: there is none of that name."""
         mesh = self.mesh
@@ -569,3 +574,8 @@ def changed(name: str, change: Tensor) -> dict[str, Value]:
     """Say a change of searched colours, display-referred: the largest, and the root of the mean square."""
     root_mean_square = change.square().mean().sqrt()
     return {f"{name}.linf": measure(change.abs().max(), "sRGB"), f"{name}.rms": measure(root_mean_square, "sRGB")}
+
+
+def file_name(name: str) -> str:
+    """Return a control's name as it stands in names of files: texture@chair of texture:chair."""
+    return name.replace(":", "@")

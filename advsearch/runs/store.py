@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
-from advsearch.options import Value
+from advsearch.options import NOT_A_NUMBER, Value
 from advsearch.runs.files import SCHEMA, check_version, connect_to_write
 from advsearch.runs.results import plain
 from advsearch.trust.databases import DAMAGED, check_schema, connect_to_read, readable
@@ -94,6 +94,7 @@ class Store:
     block."""
 
     FILE: ClassVar[str] = NAME  # in the directory of a run
+    NOT_A_NUMBER: ClassVar[str] = NOT_A_NUMBER  # the prediction of a row without a label
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path

@@ -14,7 +14,7 @@ from samples import make_attacked
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.projection import write_projection
+from advsearch.cli.exporters.projection.images import write_projection
 from advsearch.controls import make_control
 from advsearch.controls.projector.projector import AMBIENT, ProjectorControl
 from advsearch.controls.space import Space
