@@ -31,7 +31,6 @@ CORE = {
 NOT_YET: frozenset[str] = frozenset(
     {
         "advsearch/cli/exporters/dataset.py",
-        "advsearch/cli/exporters/scene.py",
         "advsearch/cli/exporters/sheets.py",
         "advsearch/questions/check/__init__.py",
         "advsearch/questions/check/carry_out.py",

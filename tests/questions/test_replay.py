@@ -46,7 +46,7 @@ def test_an_adversarial_scene_is_rendered_again_under_every_condition(
     attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = tmp_path / "run"
-    monkeypatch.setattr("advsearch.scene.importing.blender.shutil.which", lambda name: None)
+    monkeypatch.setattr("advsearch.trust.programs.shutil.which", lambda name: None)
     assert main(["replay", str(attacked), "--trials", "6", "--model", "small_models:hard", "--code", EASY, "--run",
                  str(run), "--json", "--quiet"]) == 0  # fmt: skip
     said = json.loads(capsys.readouterr().out)

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 from advsearch.pictures import FORMATS as FORMATS
 from advsearch.pictures import check_decodable as check_decodable
 from advsearch.scene.assets import face_vectors as face_vectors
+from advsearch.scene.glb import PLAIN as PLAIN
 from advsearch.scene.glb import GlbBuffer as GlbBuffer
+from advsearch.scene.glb import glb as glb
 from advsearch.scene.glb import mime_type as mime_type
 from advsearch.scene.importing.files import SPLATS as SPLATS
 from advsearch.scene.importing.files import Notes as Notes

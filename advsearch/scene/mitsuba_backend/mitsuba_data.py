@@ -1,4 +1,4 @@
-"""What controls read of Mitsuba: numbers and colors of a scene by its own names, and the tables of its sky."""
+"""What added parts need of Mitsuba: its names of a scene's numbers and colors, the tables of its sky, its files."""
 
 from __future__ import annotations
 
@@ -17,6 +17,9 @@ from advsearch.scene.description import SceneDescription
 from advsearch.scene.mitsuba_backend.parts import color, number
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mi
+from advsearch.scene.mitsuba_backend.writing import NAME as NAME
+from advsearch.scene.mitsuba_backend.writing import SCATTERINGS as SCATTERINGS
+from advsearch.scene.mitsuba_backend.writing import write_scene as write_scene
 from advsearch.scene.parts import PluginNumber
 from advsearch.scene.settings import CHANNELS
 

@@ -18,7 +18,7 @@ class Gltf(Exporter):
     suffix = "glb"
 
     def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
-        from advsearch.api.export import write_gltf  # takes seconds
+        from advsearch.cli.exporters.scene.files import write_gltf  # takes seconds
 
         notes = write_gltf(run, out)
         return Exported({"notes": notes}, " ".join([f"The object is in {out}.", *notes]))
@@ -33,7 +33,7 @@ class MitsubaScene(Exporter):
     suffix = "xml"
 
     def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
-        from advsearch.api.export import write_mitsuba  # takes seconds
+        from advsearch.cli.exporters.scene.files import write_mitsuba  # takes seconds
 
         notes = write_mitsuba(run, out)
         return Exported({"notes": notes}, " ".join([f"The scene is in {out}.", *notes]))
