@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from advsearch import statistics as statistics
     from advsearch import tasks as tasks
     from advsearch.api.export import AdversarialRun as AdversarialRun
+    from advsearch.api.rendered_rows import render_rows as render_rows
     from advsearch.attacks import Domain as Domain
     from advsearch.attacks import Evaluation as Evaluation
     from advsearch.attacks import Policy as Policy
@@ -82,6 +83,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "advsearch.api.export": ("AdversarialRun",),
+    "advsearch.api.rendered_rows": ("render_rows",),
     "advsearch.attacks": ("Domain", "Evaluation", "Policy", "Proposal"),
     "advsearch.config": ("SceneConfig",),
     "advsearch.controls.base": ("Choice", "Control", "Parameter", "Values"),

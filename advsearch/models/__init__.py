@@ -7,7 +7,7 @@ from advsearch.interrupts import INTERRUPTS
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.features import PARTS, pooled
 from advsearch.models.inputs import WithState
-from advsearch.models.labels import LabelSet, find_label_set, matching_labels, patterns, read_labels
+from advsearch.models.labels import LabelSet, find_label_set, matching_labels, names_nothing, patterns, read_labels
 from advsearch.models.loading import load_model
 from advsearch.models.model import (
     PRESETS,
@@ -69,6 +69,7 @@ __all__ = [
     "load_weights",
     "matching_labels",
     "may_fetch",
+    "names_nothing",
     "near_names",
     "patterns",
     "png_of",

@@ -92,6 +92,10 @@ GIVEN_BY = {
 class RemoteNetwork:
     """A network elsewhere that only answers. A run keeps its answers, and states what they cost."""
 
+    def __call__(self, pictures: Tensor) -> Any:
+        """Return what the network says of pictures (N, 3, H, W) in [0, 1]."""
+        raise NotImplementedError
+
     @property
     def sentence(self) -> str:
         """What a run has spent, for its reader."""

@@ -180,6 +180,7 @@ __all__ = [
     "Said",
     "Sight",
     "Task",
+    "Together",
     "Truth",
     "Truths",
     "all_said",

@@ -14,7 +14,7 @@ class _Dataset(Exporter):
     options = ("all",)
 
     def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
-        from advsearch.api.dataset import write_dataset  # takes seconds
+        from advsearch.cli.exporters.dataset.files import write_dataset  # takes seconds
 
         count, notes = write_dataset(run, out, self.name, every=bool(options["all"]), progress=progress)
         if not count:
