@@ -16,9 +16,10 @@ class BuiltIn(NamedTuple):
     """A built-in part.
 
     Attributes:
-        kind: "experiment", "control", "policy", "task", "model source", "exporter", "reader" of mesh files, or
-            "converter" of files to glTF.
-        name: the word for it on the command line; of a reader or converter the suffix of its files.
+        kind: "experiment", "control", "policy", "task", "model source", "recognizer" of networks from Python,
+            "exporter", "reader" of mesh files, or "converter" of files to glTF.
+        name: the word for it on the command line; of a reader or converter the suffix of its files, of a recognizer
+            the library of its networks.
         target: "module:attribute" that is imported when the part is used.
         help: what it does, in a line that begins in lower case and has no full stop.
     """
@@ -119,7 +120,7 @@ BUILT_INS = (
         "a picture that a projector throws onto the object",
     ),
     BuiltIn(
-        "control", "spot", f"{_CONTROLS}.spot:SpotControl",
+        "control", "spot", f"{_CONTROLS}.projector:SpotControl",
         "the spot of a torch or a laser on the object",
     ),
     BuiltIn(
@@ -263,15 +264,15 @@ BUILT_INS = (
         "several cameras take pictures of one configuration, and one prediction is made of what a model says of each",
     ),
     BuiltIn(
-        "model source", "torchvision", f"{_MODELS}.zoo.outputs:load_torchvision",
+        "model source", "torchvision", f"{_MODELS}.zoo:load_torchvision",
         "a network of torchvision with its published weights",
     ),
     BuiltIn(
-        "model source", "timm", f"{_MODELS}.zoo.outputs:load_timm",
+        "model source", "timm", f"{_MODELS}.zoo:load_timm",
         "a network of timm with its published weights",
     ),
     BuiltIn(
-        "model source", "hf", f"{_MODELS}.zoo.transformers:load",
+        "model source", "hf", f"{_MODELS}.zoo:load_transformers",
         "a network of transformers from a repository of Hugging Face or a directory",
     ),
     BuiltIn(
@@ -281,6 +282,14 @@ BUILT_INS = (
     BuiltIn(
         "model source", "https", f"{_MODELS}.address:load",
         "a model behind an address",
+    ),
+    BuiltIn(
+        "recognizer", "transformers", f"{_MODELS}.zoo:recognize_transformers",
+        "a network of transformers that was made in Python",
+    ),
+    BuiltIn(
+        "recognizer", "timm", f"{_MODELS}.zoo:recognize_timm",
+        "a network of timm that was made in Python",
     ),
     BuiltIn(
         "exporter", "coco", f"{_EXPORTERS}.dataset:Coco",

@@ -1,5 +1,4 @@
 """What an added experiment, control, task, policy, model source, reader or exporter may import from advsearch.
-
     from advsearch.extend import Control, Parameter, Values
 
 Everything else in the package may change without notice. The built-in parts that the core does without use this module
@@ -15,15 +14,20 @@ from typing import TYPE_CHECKING, Any
 from advsearch import __version__ as __version__
 
 if TYPE_CHECKING:
+    from advsearch import models as models
     from advsearch import rules as rules
     from advsearch import seeds as seeds
     from advsearch import settings as settings
     from advsearch import statistics as statistics
+    from advsearch import tasks as tasks
     from advsearch.api import workbench as workbench
+    from advsearch.api.export import AdversarialRun as AdversarialRun
+    from advsearch.api.rendered_rows import render_rows as render_rows
     from advsearch.attacks import Domain as Domain
     from advsearch.attacks import Evaluation as Evaluation
     from advsearch.attacks import Policy as Policy
     from advsearch.attacks import Proposal as Proposal
+    from advsearch.attacks import policies as policies
     from advsearch.config import DerivativeConfig as DerivativeConfig
     from advsearch.config import SceneConfig as SceneConfig
     from advsearch.controls.base import Choice as Choice
@@ -34,6 +38,7 @@ if TYPE_CHECKING:
     from advsearch.controls.ranges import OneOf as OneOf
     from advsearch.controls.ranges import Range as Range
     from advsearch.controls.support import images as images
+    from advsearch.controls.support.picture_control import PictureControl as PictureControl
     from advsearch.engine import gradients as gradients
     from advsearch.engine.problem import Problem as Problem
     from advsearch.errors import FileFormatError as FileFormatError
@@ -45,6 +50,7 @@ if TYPE_CHECKING:
     from advsearch.experiment import experiment as experiment
     from advsearch.experiment import fail_check as fail_check
     from advsearch.models import Model as Model
+    from advsearch.options import Value as Value
     from advsearch.progress import Progress as Progress
     from advsearch.questions.attack.settings import AttackConfig as AttackConfig
     from advsearch.questions.sweep.settings import SweepConfig as SweepConfig
@@ -72,6 +78,8 @@ if TYPE_CHECKING:
     from advsearch.scene import library as library
     from advsearch.scene import parts as parts
     from advsearch.scene.description import SceneDescription as SceneDescription
+    from advsearch.scene.importing import reading as reading
+    from advsearch.scene.mitsuba_backend import mitsuba_data as mitsuba_data
     from advsearch.settings import Clash as Clash
     from advsearch.settings import Config as Config
     from advsearch.settings import setting as setting
@@ -82,16 +90,21 @@ if TYPE_CHECKING:
     from advsearch.tasks import Task as Task
     from advsearch.trust import stored_files as stored_files
     from advsearch.trust import writing as writing
+    from advsearch.viewer import thumbnails as thumbnails
 
 _NAMES = {
+    "advsearch.api.export": ("AdversarialRun",),
+    "advsearch.api.rendered_rows": ("render_rows",),
     "advsearch.attacks": ("Domain", "Evaluation", "Policy", "Proposal"),
     "advsearch.config": ("DerivativeConfig", "SceneConfig"),
     "advsearch.controls.base": ("Choice", "Control", "Parameter", "Values"),
     "advsearch.controls.ranges": ("Fixed", "OneOf", "Range"),
+    "advsearch.controls.support.picture_control": ("PictureControl",),
     "advsearch.engine.problem": ("Problem",),
     "advsearch.errors": ("FileFormatError", "InputError", "ModelError", "UnknownNameError"),
     "advsearch.experiment": ("PositionalArgument", "RunContext", "experiment", "fail_check"),
     "advsearch.models": ("Model",),
+    "advsearch.options": ("Value",),
     "advsearch.progress": ("Progress",),
     "advsearch.questions.attack.settings": ("AttackConfig",),
     "advsearch.questions.sweep.settings": ("SweepConfig",),
@@ -115,13 +128,19 @@ _MODULES = {
     "gradients": "advsearch.engine.gradients",
     "images": "advsearch.controls.support.images",
     "library": "advsearch.scene.library",
+    "mitsuba_data": "advsearch.scene.mitsuba_backend.mitsuba_data",
+    "models": "advsearch.models",
     "parts": "advsearch.scene.parts",
+    "policies": "advsearch.attacks.policies",
+    "reading": "advsearch.scene.importing.reading",
     "results": "advsearch.runs.results",
     "rules": "advsearch.rules",
     "seeds": "advsearch.seeds",
     "settings": "advsearch.settings",
     "statistics": "advsearch.statistics",
     "stored_files": "advsearch.trust.stored_files",
+    "tasks": "advsearch.tasks",
+    "thumbnails": "advsearch.viewer.thumbnails",
     "wording": "advsearch.report.wording",
     "workbench": "advsearch.api.workbench",
     "writing": "advsearch.trust.writing",

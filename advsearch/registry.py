@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
 
 from advsearch.catalog import BuiltIn, list_built_ins
@@ -23,7 +23,8 @@ Entry = TypeVar("Entry")
 
 @dataclass(eq=False, repr=False)
 class Registry(Mapping[str, Entry], Generic[Entry]):
-    """Entries by name: our own first, in the order given, then those of installed packages; ours win a name."""
+    """Entries by name: our own first, in the order given, then those of installed packages; ours win. An entry is
+    imported when it is asked for, so that a package which can't be imported disturbs no other."""
 
     group: str  # of entry points: "advsearch.policies"
     own: Mapping[str, Entry | BuiltIn]  # our entries; one of the catalog is imported when it is asked for
@@ -37,7 +38,9 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """Return an entry. Raises InputError where the class that a name is cannot be imported, is something else, or
         must not be imported (`check_import`)."""
         if not self.names_class(name):
-            own = self.own[name] if name in self.own else self._installed[name]
+            if name not in self.own:
+                return self._load(name)
+            own = self.own[name]
             entry: Entry = imported(own.target) if isinstance(own, BuiltIn) else own
             return entry
         check_import(name)
@@ -81,19 +84,21 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return all(part.isidentifier() for part in parts) and not (parts[0] in self.own or parts[0] in self._installed)
 
     @cached_property
-    def _installed(self) -> dict[str, Entry]:
-        entries: dict[str, Entry] = {}
-        for point in entry_points(group=self.group):
-            where = f"entry point {point.name} = {point.value} of group {self.group}"
-            mend = "repair or uninstall the package that declares it"
-            try:
-                entry = point.load()
-            except (ImportError, AttributeError) as error:
-                raise InputError(f"{where}: cannot be imported ({error}); {mend}") from None
-            if not self.fits(point.name, entry):
-                raise InputError(f"{where}: expected {self.expected}; {mend}")
-            entries[point.name] = entry
-        return entries
+    def _installed(self) -> dict[str, EntryPoint]:
+        return {point.name: point for point in entry_points(group=self.group)}
+
+    def _load(self, name: str) -> Entry:
+        """Import what an entry point names. Raises InputError: it can't be imported, or is something else."""
+        point = self._installed[name]
+        where = f"entry point {name} = {point.value} of group {self.group}"
+        mend = "repair or uninstall the package that declares it"
+        try:
+            entry: Entry = point.load()
+        except Exception as error:  # another package's code may raise anything
+            raise InputError(f"{where}: cannot be imported ({error}); {mend}") from None
+        if not self.fits(name, entry):
+            raise InputError(f"{where}: expected {self.expected}; {mend}")
+        return entry
 
 
 def get_first_doc_line(entry: Any) -> str:

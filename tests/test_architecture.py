@@ -119,7 +119,7 @@ OPTIONAL = {
 """Packages that only an extra brings, and which: imported inside a function that says what to do where it is not."""
 
 
-OF_A_PROCESS = {f"advsearch.scene.importing.{name}": "pxr" for name in ("usd_layers", "usd_stage", "usd_surface")}
+OF_A_PROCESS = {f"advsearch.scene.importing.usd.{name}": "pxr" for name in ("layers", "stage", "surface")}
 """Modules that run in a process of their own, and what only they import, which an extra brings."""
 
 
@@ -378,7 +378,7 @@ def test_an_attack_on_what_is_bundled_needs_little() -> None:
 def test_the_process_that_reads_usd_needs_little() -> None:
     """Every such file starts one."""
     pytest.importorskip("pxr")
-    code = f"import advsearch.scene.importing.usd_stage\n{SHOW_HEAVY}"
+    code = f"import advsearch.scene.importing.usd.stage\n{SHOW_HEAVY}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
 
@@ -391,7 +391,7 @@ NOT_MESSAGES = (
     "advsearch.viewer.document",
     "advsearch.trust.programs",
     "advsearch.scene.importing.files",
-    "advsearch.scene.importing.usd_layers",
+    "advsearch.scene.importing.usd.layers",
 )
 """Modules that read or write flags themselves, also those of another program, and a style sheet."""
 

@@ -15,7 +15,6 @@ from typing import Any
 from xml.etree import ElementTree
 
 import check_docs
-import numpy as np
 import pytest
 import reference_calibration as calibration
 import torch
@@ -52,9 +51,7 @@ from advsearch.questions.sweep.axes import read_axes
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig, read_suite
 from advsearch.runs import export
-from advsearch.runs.directory import RunDirectory
 from advsearch.runs.exporters import EXPORTERS
-from advsearch.runs.store import Row
 from advsearch.scene import library
 from advsearch.scene.importing.scenes import MITSUBA_FILE, split_node
 from advsearch.scene.rig import read_rig
@@ -329,16 +326,6 @@ def test_the_predictor_of_the_page_is_as_good_as_a_render() -> None:
     still = u.detach()
     deviation = compared(lambda view: view_of(renderer, picture.detach(), still, view, 16, lambda *_: 0.0))
     assert deviation.good, deviation.reason
-
-
-@pytest.mark.docs
-def test_the_export_of_the_page_writes_a_file(tmp_path: Path) -> None:
-    with RunDirectory.create(str(tmp_path / "run"), config=AttackConfig(object="mug", controls="pose")) as run:
-        run.record(Row("search", 0, score=0.5), Row("search", 1, score=0.25))
-    write = code_with("development.md", "Writer(")["_npz"]
-    told, text = write(SimpleNamespace(run=str(run.path), kind=None), tmp_path / "scores.npz")
-    assert told == {"rows": 2} and text.startswith("2 scores")
-    assert np.load(tmp_path / "scores.npz")["scores"].tolist() == [0.5, 0.25]
 
 
 # ---- the scripts ----------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from advsearch.controls import CONTROLS
 from advsearch.errors import InputError
 from advsearch.models.loading import SOURCES
 from advsearch.registry import Registry
+from advsearch.scene.importing import readers
+from advsearch.scene.importing.objects import import_object
 from advsearch.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,14 +57,19 @@ def test_own_entries_come_first_and_win_and_those_of_the_catalog_are_imported(mo
 
 @pytest.mark.parametrize(
     ("entry", "complaint"),
-    [("two", "expected a number"), (ImportError("no module x"), r"cannot be imported \(no module x\)")],
+    [
+        ("two", "expected a number"),
+        (ImportError("no module x"), r"cannot be imported \(no module x\)"),
+        (RuntimeError("too old"), r"cannot be imported \(too old\)"),
+    ],
 )
 def test_an_entry_that_does_not_fit_is_named_with_its_package(
     monkeypatch: pytest.MonkeyPatch, entry: Any, complaint: str
 ) -> None:
-    numbers = with_points(monkeypatch, Point("two", entry))
+    numbers = with_points(monkeypatch, Point("two", entry), Point("three", 3))
     with pytest.raises(InputError, match=rf"entry point two = other:two of group advsearch\.numbers: {complaint}"):
-        list(numbers)
+        numbers["two"]
+    assert list(numbers) == ["one", "mod", "two", "three"] and numbers["three"] == 3  # it disturbs no other
 
 
 @pytest.mark.parametrize("known", [CONTROLS, POLICIES, OBJECTIVE_KINDS, TASKS, SOURCES], ids=lambda known: known.group)
@@ -157,3 +165,66 @@ def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_p
 
     (view,) = rendered["views"]
     assert view["answers"][0]["probability"] is None and 0.3 < float(view["answers"][0]["label"].split()[0]) < 0.5
+
+
+USE_PARTS = """
+import json, sys
+from pathlib import Path
+from advsearch.controls import make_control
+from advsearch.progress import NullProgress
+from advsearch.runs.exporters import EXPORTERS
+from advsearch.runs.store import Row, Store
+from advsearch.scene.importing.objects import import_object
+
+run = Path("run")
+run.mkdir()
+(run / "run.yaml").write_text("command: sweep\\n")
+with Store(run / Store.FILE) as store:
+    store.append([Row("sweep", step, margin=margin) for step, margin in enumerate((0.5, -1.5))])
+exported = EXPORTERS["margins"]().write("run", Path("margins.txt"), {}, NullProgress())
+mesh = import_object("cube.off").mesh
+print(json.dumps([make_control("fade", {"amount": [0, 1]}).kind, exported.facts, exported.text, len(mesh.faces)]))
+try:
+    import_object("broken.off")
+except Exception as error:
+    print(error)
+"""
+
+CUBE = """OFF
+8 12 0
+0 0 0  1 0 0  1 1 0  0 1 0  0 0 1  1 0 1  1 1 1  0 1 1
+3 0 2 1  3 0 3 2  3 4 5 6  3 4 6 7  3 0 1 5  3 0 5 4
+3 1 2 6  3 1 6 5  3 2 3 7  3 2 7 6  3 3 0 4  3 3 4 7
+"""
+
+
+def test_its_control_exporter_and_reader_work(installed: Path, tmp_path: Path) -> None:
+    (tmp_path / "cube.off").write_text(CUBE)
+    (tmp_path / "broken.off").write_text(CUBE.replace("3 0 2 1", "3 0 9 1"))
+    outside = {**os.environ, "PYTHONPATH": os.pathsep.join([str(installed), str(ROOT)])}
+    done = subprocess.run(
+        [sys.executable, "-c", USE_PARTS], cwd=tmp_path, env=outside, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    answer, refusal = done.stdout.splitlines()
+    assert json.loads(answer) == ["fade", {"rows": 2}, "2 margins in margins.txt.", 12]
+    assert (tmp_path / "margins.txt").read_text() == "0.5\n-1.5\n"
+    assert "broken.off: expected faces with points that are there" in refusal
+
+
+def test_a_reader_that_cannot_be_imported_disturbs_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is an installed package: a folder of the Python path with a description of its distribution."""
+    package = tmp_path / "site" / "broken_reader-1.0.dist-info"
+    package.mkdir(parents=True)
+    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-reader\nVersion: 1.0\n")
+    (package / "entry_points.txt").write_text("[advsearch.readers]\nlost = module_that_is_not_there:read\n")
+    monkeypatch.syspath_prepend(str(package.parent))
+    monkeypatch.setattr(readers, "READERS", replace(readers.READERS))  # it looks for packages anew
+
+    assert readers.list_suffixes()[-1] == ".lost"
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+    (tmp_path / "solid.obj").write_text(f"{corners}f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    assert len(import_object(tmp_path / "solid.obj").mesh.faces) == 4
+    (tmp_path / "solid.lost").write_text("anything")
+    with pytest.raises(InputError, match=r"entry point lost = module_that_is_not_there:read .*: cannot be imported"):
+        import_object(tmp_path / "solid.lost")

@@ -6,10 +6,8 @@ Other programs get the adversarial scene. Printed are patches, and textures unwr
 from __future__ import annotations
 
 import math
-import os
-import tempfile
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +16,8 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-import advsearch
 from advsearch import seeds
-from advsearch.controls.space import file_name
+from advsearch.controls.base import file_name
 from advsearch.controls.support.images import enlarged
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.loading import Scene, as_controls, load_scene
@@ -34,15 +31,10 @@ from advsearch.report.sheets import Mask, Piece
 from advsearch.runs.directory import ARTIFACTS, CONFIG, find_run
 from advsearch.runs.files import read_png, to_8bit
 from advsearch.scene.assembly import ON_PICTURE, posed
-from advsearch.scene.assets import Floats, Ints, Mesh
+from advsearch.scene.assets import Floats, Ints, Mesh, Shape
 from advsearch.scene.description import NO_MAP, OBJECT
-from advsearch.scene.glb import PLAIN, glb
-from advsearch.scene.mitsuba_backend.writing import NAME, SCATTERINGS, write_scene
-from advsearch.scene.parts import HazePart
+from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import doubled_areas, rasterised
-from advsearch.trust.writing import placed_by, storage_errors, write_bytes, write_text
-
-GLB, XML = ".glb", ".xml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +45,45 @@ class AdversarialRun:
     folder: Path
     problem: Problem
     u: Tensor
+
+    @classmethod
+    def load(cls, run: str | Path) -> AdversarialRun:
+        """Load the scene of a run of `attack` that has ended, by its name or folder, and its adversarial configuration.
+
+        Raises InputError where it has none, or its scene is another one now, and FileFormatError where it did not end,
+        or is of another command.
+        """
+        folder = find_run(run)
+        summary = attack_of(folder)
+        if summary.adversarial is None:
+            raise InputError(
+                f"{folder}: ended with {summary.ending!r}, so that there is no adversarial configuration to export"
+            )
+        problem, _ = problem_from_config(judged_alone(AttackConfig.from_yaml(folder / CONFIG)))
+        trial = summary.adversarial.trial  # where conditions vary, those of the picture that the run keeps
+        draw = None if trial is None else seeds.stream(problem.seed, "verification", trial)
+        return cls(folder, problem, problem.whole(kept_configuration(folder, problem), draw))
+
+    def split_inputs(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Return the inputs of the scene inside Mitsuba, and those that are applied to its image."""
+        inputs = self.inputs
+        on_image = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
+        return inputs, on_image
+
+    def posed_object(self) -> tuple[MeshPart, Shape]:
+        """Return the object as the scene describes it, and as it is there: displaced, in its pose, with its texture."""
+        description = self.problem.space.scene
+        assert description is not None
+        part = description.meshes[OBJECT]
+        return part, posed(part, self.inputs)
+
+    def render(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
+        """Render the scene with some inputs, as the run does it: an image (H, W, 3) sRGB in [0, 1]."""
+        renderer = self.problem.renderer
+        traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+        with torch.no_grad():
+            rendered = renderer.rendered(traced, seed, spp, "backdrop.color" in inputs)
+            return renderer.finished(rendered, inputs, self.u)
 
     @property
     def on_picture(self) -> list[str]:
@@ -67,97 +98,6 @@ class AdversarialRun:
         renderer = self.problem.renderer
         with torch.no_grad():
             return renderer.scene.assembly(renderer.space.inputs(self.u))
-
-
-def adversarial_of(run: str | Path) -> AdversarialRun:
-    """Load the scene of a run of `attack` that has ended, by its name or folder, and its adversarial configuration.
-    Raises InputError where it has none, or its scene is another one now, and FileFormatError where it did not end, or
-    is of another command."""
-    folder = find_run(run)
-    summary = attack_of(folder)
-    if summary.adversarial is None:
-        raise InputError(
-            f"{folder}: ended with {summary.ending!r}, so that there is no adversarial configuration to export"
-        )
-    problem, _ = problem_from_config(judged_alone(AttackConfig.from_yaml(folder / CONFIG)))
-    trial = summary.adversarial.trial  # where conditions vary, those of the picture that the run keeps
-    draw = None if trial is None else seeds.stream(problem.seed, "verification", trial)
-    return AdversarialRun(folder, problem, problem.whole(kept_configuration(folder, problem), draw))
-
-
-def write_mitsuba(run: str | Path, out: Path) -> list[str]:
-    """Write the adversarial scene of a run as XML with its meshes and pictures beside it, whose names begin with its
-    own, to a file that ends in .xml, or a folder for `scene.xml`; return sentences about how its picture becomes that
-    of the run, and what is no part of it. Raises errors as `adversarial_of`, and InputError where such files are there,
-    or stock Mitsuba has no such scene."""
-    path = out if out.suffix.lower() == XML else out / NAME
-    taken = [path, *path.parent.glob(f"{path.stem}-*")] if path.parent.is_dir() else []
-    there = [file for file in taken if os.path.lexists(file)]
-    if there or path.parent.is_file() or os.path.islink(out):
-        raise InputError(f"out: {(there or [path.parent])[0]} is there already; choose another name")
-    adversarial = adversarial_of(run)
-    renderer, inputs = adversarial.problem.renderer, adversarial.inputs
-    on_picture = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
-    backdrop = on_picture.get("backdrop.color")
-    hazes = (part.name for part in renderer.scene.made[0].parts if isinstance(part, HazePart))
-    hazy = any(float(inputs[f"{name}.density"]) > 0.0 for name in hazes)
-    if hazy and backdrop is not None:
-        raise InputError(f"{adversarial.folder}: haze before a plain background is no part of a Mitsuba scene")
-    gain = renderer.formation.gain
-    if "camera.exposure" in on_picture:
-        gain *= float(torch.exp2(on_picture["camera.exposure"]))
-    height, width = renderer.formation.resolution
-    notes = [
-        f"The sensor has {width} x {height} pixels, and light paths have at most {renderer.scene.max_depth} segments.",
-        f"The run's picture is the sRGB curve of {gain:.9g} times this radiance, cut off at 1.",
-    ]
-    if backdrop is not None:
-        red, green, blue = (f"{one:.9g}" for one in (backdrop / renderer.formation.gain).tolist())
-        notes.append(f"Where its alpha is under 1, add 1 - alpha times the plain background ({red}, {green}, {blue}).")
-    if hazy:
-        notes.append(f"Haze scatters light, which Mitsuba counts as a segment: {SCATTERINGS} more are for that.")
-    if renderer.formation.denoiser != "none":
-        notes.append("Not in it: the denoiser. Take many samples a pixel.")
-    if adversarial.on_picture:
-        notes.append(f"Not in it: what the control {', '.join(adversarial.on_picture)} did to the finished picture.")
-    if adversarial.problem.conditions is not None:
-        notes.append("What varied by chance in the run is as in the clean scene.")
-    with placed_by("out"), storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as made:
-            write_scene(renderer.scene, inputs, Path(made) / path.name, " ".join(notes), hide=backdrop is not None)
-            for one in sorted(Path(made).iterdir()):
-                os.replace(one, path.parent / one.name)
-        what = f"The adversarial scene of {adversarial.folder.name} as a scene for Mitsuba 3"
-        text = [f"{what} (advsearch {advsearch.__version__}).\n", *notes, ""]
-        write_text(path.with_name(f"{path.stem}-README.txt"), "\n".join(text), durable=False)
-    return notes
-
-
-def write_gltf(run: str | Path, out: Path) -> list[str]:
-    """Write the object of a run's adversarial scene as binary glTF, a file that ends in .glb: displaced and in its
-    pose, with its texture; return sentences about what is not as in the run. Raises errors as `adversarial_of`, and
-    InputError where the file is called otherwise."""
-    if out.suffix.lower() != GLB:
-        raise InputError(f"out: expected the name of a .glb file, got {out}")
-    adversarial = adversarial_of(run)
-    description = adversarial.problem.space.scene
-    assert description is not None
-    part = description.meshes[OBJECT]
-    found, metres = posed(part, adversarial.inputs), description.object.metres
-    if metres is not None:
-        found = replace(found, mesh=replace(found.mesh, vertices=found.mesh.vertices * np.float32(metres)))
-    with placed_by("out"):
-        write_bytes(out, glb([found]))
-    unit = "object sizes" if metres is None else "metres"
-    notes = [f"Lengths are in {unit}, y is up, and the texture is rounded to 8 bits."]
-    if part.surface is not None:
-        notes.append("Its surface is one of Mitsuba's own, of which glTF has the base colour only.")
-    elif found.material.specular > PLAIN:
-        notes.append(
-            f"A specular of {found.material.specular:g} is over glTF's largest, {PLAIN:g}, which it has there."
-        )
-    return notes
 
 
 BLEED = 3.0  # millimetres of colour beyond the line to cut

@@ -27,7 +27,6 @@ from advsearch.attacks.verification import OVER_CONDITIONS as OVER_CONDITIONS
 from advsearch.attacks.verification import WORST_CASE as WORST_CASE
 from advsearch.cluster import InProcess as InProcess
 from advsearch.controls import CONTROLS as CONTROLS
-from advsearch.controls.support.meshes import sphere as sphere
 from advsearch.engine.image_changes import AWAY as AWAY
 from advsearch.engine.image_changes import as_claimed as as_claimed
 from advsearch.engine.image_changes import changed as changed
@@ -82,6 +81,7 @@ from advsearch.scene.glb import glb as glb
 from advsearch.scene.grounds import paved as paved
 from advsearch.scene.importing.files import last_line as last_line
 from advsearch.scene.parts import PluginPart as PluginPart
+from advsearch.scene.parts import sphere as sphere
 from advsearch.scene.renderer import MAX_SPP as MAX_SPP
 from advsearch.tasks import make_task as make_task
 from advsearch.threads import all_for_torch as all_for_torch

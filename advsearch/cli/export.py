@@ -77,7 +77,9 @@ def export(args: argparse.Namespace) -> int:
         raise InputError(f"--out: {format} writes {exporter.writes}; give its name")
     if args.kind is not None and "kind" not in exporter.options:
         raise InputError("--kind: is only for tables of rows; leave it out")
-    exported = exporter.write(args.run, out, {option: getattr(args, option, None) for option in exporter.options})
+    options = {option: getattr(args, option, None) for option in exporter.options}
+    with output.at_work(as_json=True, quiet=False) as progress:
+        exported = exporter.write(args.run, out, options, progress)
     facts = {"command": "export", "format": format, **exported.facts, "out": str(out)}
     return output.say(args.json, facts, exported.text, sys.stderr)
 

@@ -15,19 +15,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named, number
-from advsearch.controls.ranges import Fixed, Number
-from advsearch.errors import InputError
-from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.grounds import on_its_ground
-from advsearch.scene.settings import CHANNELS
+from advsearch.extend import Choice, Control, Fixed, InputError, Parameter, SceneDescription, Value, Values, color
 
 COLOR = "backdrop.color"  # the scene input: (3,) display-linear values in [0, 1]
 WHAT = ("colour", "environment")
 NUMBERS = ("hue", "saturation", "value")
 
-_image = partial(number, ("image",))
+_image = partial(Parameter.number, ("image",))
 
 
 class BackgroundControl(Control):
@@ -36,7 +30,7 @@ class BackgroundControl(Control):
     kind = "background"
     amount = "what"
     parameters = (
-        named("what", WHAT, "colour", "What is behind the object: the colour, or the environment as ever."),
+        Parameter.named("what", WHAT, "colour", "What is behind the object: the colour, or the environment as ever."),
         _image("hue", "degrees", 0.0, 360.0, 0.0, "Hue: 0 is red, 120 green, 240 blue.", (0.0, 360.0), periodic=True),
         _image("saturation", "1", 0.0, 1.0, 0.0, "Saturation: 0 is grey.", (0.0, 1.0)),
         _image("value", "sRGB", 0.0, 1.0, 0.5, "The largest of red, green and blue: 0 is black.", (0.0, 1.0)),
@@ -58,21 +52,22 @@ class BackgroundControl(Control):
         as_ever = parameter.name == "what" and "environment" in self.allowed("what")
         return replace(parameter, default="environment") if as_ever else parameter
 
-    def unchanged(self, parameter: Parameter) -> Number:
+    def unchanged(self, parameter: Parameter) -> float | str:
         return "environment" if parameter.name == "what" else parameter.default
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         scene = replace(scene, backdrop=True)
-        return on_its_ground(scene.with_values(ground__size=0.0)) if self.chosen["ground"] == "hide" else scene
+        return scene.without_ground() if self.chosen["ground"] == "hide" else scene
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if WHAT[int(values["what"])] == "environment":
             return {}
-        return {COLOR: srgb_to_linear(hsv_to_rgb(*(values[name] for name in NUMBERS)))}
+        return {COLOR: color.srgb_to_linear(hsv_to_rgb(*(values[name] for name in NUMBERS)))}
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        color = hsv_to_rgb(*(values[name] for name in NUMBERS))
-        return {name: measure(value, "sRGB") for name, value in zip(CHANNELS, color, strict=True)}
+        levels = hsv_to_rgb(*(values[name] for name in NUMBERS))
+        channels = zip(color.CHANNELS, levels, strict=True)
+        return {name: Value(value=float(level), unit="sRGB") for name, level in channels}
 
 
 def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:

@@ -25,25 +25,23 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.controls.ranges import Fixed, Number, OneOf, Range, Slot, Spec, is_number, plain, read, same, shown
+from advsearch.controls.ranges import Fixed, Number, OneOf, Range, Slot, Spec, plain, read, same, shown
 from advsearch.copies import copied, hand_copies, is_ours
 from advsearch.distributions import as_setting
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import Value as Value
 from advsearch.options import rounded
-from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription, check_one_environment
 from advsearch.scene.gradients import WHOLE_RANGE as WHOLE_RANGE
 from advsearch.scene.gradients import Budget as Budget
 from advsearch.scene.gradients import Group as Group
 from advsearch.scene.parts import MeshPart, PluginPart
-from advsearch.scene.settings import CHANNELS, SETTINGS
+from advsearch.scene.settings import SETTINGS
 from advsearch.scene.settings import Parameter as Parameter
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-WAY = "way"  # the parameter that says which of several paths is taken
 LARGEST_EPSILON = 1e6  # no distance from where a control starts is larger, in whichever norm
 
 # Where a control leaves out a value of the clean scene that was asked for, the two contradict each other, and that is
@@ -151,12 +149,15 @@ class Choice:
         elif self.whole is not None:
             low, high = self.whole
             allowed = f"a whole number from {low} to {high}"
-            fits = is_number(given) and low <= given <= high and given == int(given)
+            fits = Parameter.is_number(given) and low <= given <= high and given == int(given)
         elif self.most is not None and self.signed:
             allowed = f"a number from {-self.most:g} to {self.most:g}"
-            fits = is_number(given) and abs(given) <= self.most
+            fits = Parameter.is_number(given) and abs(given) <= self.most
         elif self.most is not None:
-            allowed, fits = f"a number over 0 and up to {self.most:g}", is_number(given) and 0.0 < given <= self.most
+            allowed, fits = (
+                f"a number over 0 and up to {self.most:g}",
+                Parameter.is_number(given) and 0.0 < given <= self.most,
+            )
         if not fits and not (given is None and self.default is None):
             raise InputError(f"{control}.{self.name}: expected {allowed}, got {given!r}")
 
@@ -209,6 +210,7 @@ class Control:
         InputError: a value is out of range.
     """
 
+    WAY: ClassVar[str] = "way"  # the parameter that says which of several paths is taken
     kind: ClassVar[str]
     summary: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
@@ -272,6 +274,11 @@ class Control:
     def mesh(self) -> str:
         """Name of the mesh that it is about: the one behind the colon of its name, or else the object."""
         return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
+
+    @property
+    def file_name(self) -> str:
+        """Its name as it stands in names of files."""
+        return file_name(self.name)
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
         """Return that mesh in a scene. Raises UnknownNameError: there is none of that name."""
@@ -350,11 +357,12 @@ class Control:
         """Set `start` and `groups`, and `moved` where there is something to say, for `self.scene`. Raises InputError: a
         setting of the control is impossible in this scene."""
         slots, begin = list[Slot](), 0
-        for slot in self.laid_out():
-            slots.append(replace(slot, begin=begin))
+        for parameter, spec in self.laid_out():
+            slot = Slot(parameter, spec, begin)
+            slots.append(slot)
             begin += slot.width
         self.slots = tuple(slots)
-        self.moved = tuple(self.left_out(self.slots))
+        self.moved = tuple(self._list_moved())
         self.start = torch.tensor([share for slot in slots for share in slot.start()], dtype=torch.float32)
         self.groups = tuple(self._group(slot) for slot in slots if slot.width)
         ranges = [slot.spec if isinstance(slot.spec, Range) else Range(0.0, 1.0) for slot in slots]
@@ -389,14 +397,24 @@ class Control:
         """Return how far a searched parameter may go: by default its whole range."""
         return WHOLE_RANGE
 
-    def laid_out(self) -> Iterator[Slot]:
-        """Yield the parameters in the order of their coordinates."""
+    def laid_out(self) -> Iterator[tuple[Parameter, Spec]]:
+        """Yield the parameters in the order of their coordinates, each with what it is set to."""
         for parameter in map(self.in_scene, self.own):
-            yield Slot(parameter, self.spec(parameter))
+            yield parameter, self.spec(parameter)
 
-    def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:
+    def is_compared(self, parameter: Parameter, spec: Spec) -> bool:
+        """Return whether the start has to have the clean scene's value of a parameter; by default always."""
+        return True
+
+    def note_moved(self, parameter: Parameter, scene: Number, used: Number) -> None:
+        """Note that the start has another value of a parameter than the clean scene."""
+        self.moved = (*self.moved, Moved(self.name, f"{self.name}.{parameter.name}", parameter.unit, scene, used))
+
+    def _list_moved(self) -> Iterator[Moved]:
         """Yield the values of the clean scene that the start has not. Raises InputError: one of them was asked for."""
-        for slot in slots:
+        for slot in self.slots:
+            if not self.is_compared(slot.parameter, slot.spec):
+                continue
             parameter, wanted, used = slot.parameter, self.unchanged(slot.parameter), slot.start_value()
             if self.amount not in (None, parameter.name) or same(used, wanted, turns=slot.turns):
                 continue
@@ -547,30 +565,6 @@ class Control:
 NumberControl = Control  # its name in packages that add controls
 
 
-def number(
-    estimators: tuple[str, ...], name: str, unit: str, low: float, high: float, default: float | str, text: str,
-    search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
-) -> Parameter:  # fmt: skip
-    """Return a number that moves no outlines; see `advsearch.scene.settings.moving` for one that does."""
-    return Parameter(name, (), unit, low, high, default, text, periodic, False, search, log, estimators=estimators)
-
-
-def named(
-    name: str, options: tuple[str, ...], default: str, text: str, *, estimators: tuple[str, ...] = (),
-    moves_silhouettes: bool = False,
-) -> Parameter:  # fmt: skip
-    """Return a choice among names."""
-    return Parameter(
-        name, (), "name", 0.0, len(options) - 1.0, default, text, False, moves_silhouettes, options=options,
-        estimators=estimators,
-    )  # fmt: skip
-
-
-def color_of(values: Values) -> Tensor:
-    """Return the linear colour (3,) of the display-referred numbers red, green and blue."""
-    return srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))
-
-
 def measure(value: Tensor | float, unit: str) -> Value:
     """Return a number and its unit, as configurations are described."""
     return {"value": float(value), "unit": unit}
@@ -580,3 +574,8 @@ def changed(name: str, change: Tensor) -> dict[str, Value]:
     """Say a change of searched colours, display-referred: the largest, and the root of the mean square."""
     root_mean_square = change.square().mean().sqrt()
     return {f"{name}.linf": measure(change.abs().max(), "sRGB"), f"{name}.rms": measure(root_mean_square, "sRGB")}
+
+
+def file_name(name: str) -> str:
+    """Return a control's name as it stands in names of files: texture@chair of texture:chair."""
+    return name.replace(":", "@")

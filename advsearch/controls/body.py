@@ -7,12 +7,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Control, Parameter, Value, Values
-from advsearch.controls.ranges import is_number
-from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import MeshRig
-from advsearch.scene.people import PARAMETERS
-from advsearch.scene.rigged import TIME, part_of_a_rig
+from advsearch.extend import Choice, Control, InputError, Parameter, UnknownNameError, Value, Values, parts
 
 
 class BodyControl(Control):
@@ -20,17 +15,17 @@ class BodyControl(Control):
 
     kind = "body"
     of_a_mesh = True
-    parameters = (*PARAMETERS, TIME)
+    parameters = (*parts.PERSON, parts.TIME)
     choices = (Choice("clip", None, "Name or number of the animation that `time` is of; by itself the first."),)
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         known = {parameter.name for parameter in cls.parameters}
-        parts = (part_of_a_rig(name) for name in settings if name not in known)
+        parts = (parts.part_of_a_rig(name) for name in settings if name not in known)
         return (*cls.parameters, *(part for part in parts if part is not None))
 
     @property
-    def rig(self) -> MeshRig:
+    def rig(self) -> parts.MeshRig:
         """What moves the mesh."""
         mesh = self.mesh_in(self.scene)
         if mesh.mesh.rig is None:
@@ -45,9 +40,9 @@ class BodyControl(Control):
         """The name of the animation that is played; None for none."""
         clips, asked = self.rig.clips, self.chosen["clip"]
         if asked is None:
-            timed = TIME.name in self.specs or not self._given
+            timed = parts.TIME.name in self.specs or not self._given
             return clips[0] if clips and timed else None
-        number = int(asked) if is_number(asked) or str(asked).isdigit() else -1
+        number = int(asked) if Parameter.is_number(asked) or str(asked).isdigit() else -1
         if asked not in clips and not 0 <= number < len(clips):
             raise UnknownNameError(f"{self.name}.clip", str(asked), clips, f"Animations of {self.mesh}.")
         return str(asked) if asked in clips else clips[number]

@@ -11,12 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Control, Parameter, Values, number
+from advsearch.controls.base import Control, Values
 from advsearch.controls.ranges import Fixed
 from advsearch.errors import InputError
 from advsearch.scene.assets import on_roads
@@ -25,7 +26,7 @@ from advsearch.scene.camera_model import COEFFICIENTS, NUMBERS, OF_KIND, CameraM
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import STEEPEST, affine, camera_to_world, framing_distance, middle
 from advsearch.scene.grounds import is_against_traffic, traffic_remark
-from advsearch.scene.settings import CAMERA, ORBIT, ORBIT_CAMERA, moving
+from advsearch.scene.settings import CAMERA, ORBIT_CAMERA, Parameter
 
 ROAD_USERS = (0.5, 4.0)  # metres above the road from which vehicles are seen: from a bumper to the roof of a lorry
 DISTORTION = {"k": "Radial", "p": "Tangential", "s": "Thin-prism"}
@@ -34,6 +35,8 @@ SENSOR_WIDTH = 36.0  # width in millimetres of the full-frame sensor that a foca
 
 SAME = (("fov", "focal_length"), ("elevation", "height"), ("distance", "sizes"))
 """Pairs of parameters that say the same thing."""
+_moving = partial(Parameter.moving, Parameter.ORBIT)
+_number = partial(Parameter.number, Parameter.ORBIT)
 
 
 class CameraControl(Control):
@@ -42,14 +45,14 @@ class CameraControl(Control):
     kind = "camera"
     parameters = (
         *CAMERA[:-1],
-        moving(ORBIT, "focal_length", "mm", 1.5, 2100.0, "as fov", "The same for a sensor 36 mm wide.", log=True),
-        moving(ORBIT, "sizes", "object sizes", 1e-4, 1e5, "as distance", "The same as `distance`.", log=True),
-        moving(ORBIT, "shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),
-        moving(ORBIT, "shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
-        number(ORBIT, "aperture", "object sizes", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
-        number(ORBIT, "focus", "metres", 1e-4, 1e5, "the object's middle", "Distance in focus.", log=True),
+        _moving("focal_length", "mm", 1.5, 2100.0, "as fov", "The same for a sensor 36 mm wide.", log=True),
+        _moving("sizes", "object sizes", 1e-4, 1e5, "as distance", "The same as `distance`.", log=True),
+        _moving("shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),
+        _moving("shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
+        _number("aperture", "object sizes", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
+        _number("focus", "metres", 1e-4, 1e5, "the object's middle", "Distance in focus.", log=True),
         *(
-            moving(ORBIT, name, "1", -100.0, 100.0, 0.0, f"{DISTORTION[name[0]]} distortion, as OpenCV has it.")
+            _moving(name, "1", -100.0, 100.0, 0.0, f"{DISTORTION[name[0]]} distortion, as OpenCV has it.")
             for name in COEFFICIENTS
         ),
         CAMERA[-1],

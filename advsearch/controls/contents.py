@@ -13,24 +13,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
 from scipy import ndimage
 from torch import Tensor
 
-from advsearch.controls.base import Control, Parameter, Value, Values, measure, number
-from advsearch.controls.ranges import Fixed, OneOf, Range, Spec
-from advsearch.controls.support.meshes import polygon
-from advsearch.errors import InputError
-from advsearch.scene.assets import Doubles, Ints, Material, Mesh, ObjectAsset
-from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import object_to_world
-from advsearch.scene.parts import MeshPart
-from advsearch.scene.raster import pixels_in
-from advsearch.scene.settings import LIT, ORBIT, moving
+from advsearch.extend import (
+    Control,
+    Fixed,
+    InputError,
+    OneOf,
+    Parameter,
+    Range,
+    SceneDescription,
+    Value,
+    Values,
+    color,
+    geometry,
+    images,
+    parts,
+)
 
 GRID = 128  # cells of the height map along the longer side of the mesh
 ROWS = 40  # heights at which the wall is looked for
@@ -50,21 +54,24 @@ TOTAL = 1e-6  # how far proportions may miss one
 RADIUS = 0.995  # the disc ends this close to the wall, as a share of its distance
 FIRST = 0.02
 """Below this level the disc is drawn together and sunk into the floor, so that an empty vessel shows none of it."""
-SURFACE = Material(roughness=0.08, specular=0.5)
+SURFACE = parts.Material(roughness=0.08, specular=0.5)
+
+
+_lit = partial(Parameter.number, Parameter.LIT)
 
 
 @dataclass(frozen=True, eq=False)
 class Vessel:
     """The inside of a vessel that stands upright."""
 
-    axis: Doubles  # (2,) x and y of the line that the wall is seen from
-    heights: Doubles  # (R,) evenly spaced z, from the floor to the brim
-    radii: Doubles  # (R, K) distance of the wall from the axis, in K even directions from +x counter-clockwise
-    color: Doubles  # (3,) linear reflectance of the wall's lower half
+    axis: parts.Doubles  # (2,) x and y of the line that the wall is seen from
+    heights: parts.Doubles  # (R,) evenly spaced z, from the floor to the brim
+    radii: parts.Doubles  # (R, K) distance of the wall from the axis, in K even directions from +x counter-clockwise
+    color: parts.Doubles  # (3,) linear reflectance of the wall's lower half
 
 
 @lru_cache(maxsize=8)
-def interior(asset: ObjectAsset) -> Vessel | None:
+def interior(asset: parts.ObjectAsset) -> Vessel | None:
     """Find the inside of an object in its default pose; None if it is no vessel."""
     mesh = asset.mesh
     basin = _basin(mesh)
@@ -84,11 +91,12 @@ def interior(asset: ObjectAsset) -> Vessel | None:
     height, width = asset.base_color.shape[:2]
     column = np.clip((places[:, 0] * width).astype(np.int64), 0, width - 1)
     row = np.clip(((1.0 - places[:, 1]) * height).astype(np.int64), 0, height - 1)
-    color = np.asarray(srgb_to_linear(asset.base_color[row, column]).mean(axis=0), dtype=np.float64)
-    return Vessel(axis, heights, np.where(met, radii, middle[:, None]), color)
+    wall_color = color.srgb_to_linear(asset.base_color[row, column]).mean(axis=0)
+    radii = np.where(met, radii, middle[:, None])
+    return Vessel(axis, heights, radii, np.asarray(wall_color, dtype=np.float64))
 
 
-def _basin(mesh: Mesh) -> tuple[Doubles, float, float] | None:
+def _basin(mesh: parts.Mesh) -> tuple[parts.Doubles, float, float] | None:
     """Return the axis (2,), the floor and the rim of the largest basin, or None if there is none worth the name."""
     low, cell, ground = _height_map(mesh)
     water = _filled(ground)
@@ -106,7 +114,7 @@ def _basin(mesh: Mesh) -> tuple[Doubles, float, float] | None:
     return axis, float(ground[mine].min()), float(water[mine].max())
 
 
-def _height_map(mesh: Mesh) -> tuple[Doubles, float, Doubles]:
+def _height_map(mesh: parts.Mesh) -> tuple[parts.Doubles, float, parts.Doubles]:
     """Highest surface over a grid with an empty margin: place of cell (0, 0), side of a cell, (h, w) heights. Edges are
     drawn as well as faces, so that a thin upright wall is not missed between two cells."""
     vertices = mesh.vertices.astype(np.float64)
@@ -117,7 +125,7 @@ def _height_map(mesh: Mesh) -> tuple[Doubles, float, Doubles]:
     ground = np.full((height, width), vertices[:, 2].min() - 1.0)
     corners = vertices[mesh.faces.astype(np.int64)]
     placed = (corners[..., :2] - low) / cell
-    face, row, column, weights = pixels_in(placed, (height, width))
+    face, row, column, weights = images.pixels_in(placed, (height, width))
     np.maximum.at(ground, (row, column), (weights * corners[face, :, 2]).sum(axis=1))
     for share in np.linspace(0.0, 1.0, 9):
         for begin, end in ((0, 1), (1, 2), (2, 0)):
@@ -127,7 +135,7 @@ def _height_map(mesh: Mesh) -> tuple[Doubles, float, Doubles]:
     return low, cell, ground
 
 
-def _filled(ground: Doubles) -> Doubles:
+def _filled(ground: parts.Doubles) -> parts.Doubles:
     """The level of water on a height map (h, w) from whose edges it runs off. Every cell stands as high as its ground
     or its lowest neighbour's water, whichever is higher; repeated until nothing changes."""
     water = np.full_like(ground, np.inf)
@@ -141,7 +149,7 @@ def _filled(ground: Doubles) -> Doubles:
         water[1:-1, 1:-1] = level
 
 
-def _wall(mesh: Mesh, axis: Doubles, height: float) -> tuple[Doubles, Ints]:
+def _wall(mesh: parts.Mesh, axis: parts.Doubles, height: float) -> tuple[parts.Doubles, parts.Ints]:
     """Cast level rays from the axis at one height. Returns the (COLUMNS,) distance of the first surface in each
     direction, infinite where there is none, and its face or -1."""
     corners = mesh.vertices[mesh.faces.astype(np.int64)].astype(np.float64)
@@ -180,14 +188,15 @@ class ContentsControl(Control):
     amount = "level"
     refines = frozenset({"object.to_world"})  # which is not changed; but it comes after whatever moves the vessel
     parameters = (
-        moving(
-            ORBIT, "level", "1", 0.0, 1.0, 0.0, "Height of the liquid: 0 is empty, 1 is full to the brim.", (0.0, 0.95)
+        Parameter.moving(
+            Parameter.ORBIT, "level", "1", 0.0, 1.0, 0.0, "Height of the liquid: 0 is empty, 1 is full to the brim.",
+            (0.0, 0.95),
         ),
         *(
-            number(LIT, name, "1", 0.0, 1.0, float(name == "coffee"), f"Share of {name}.", (0.0, 1.0))
+            _lit(name, "1", 0.0, 1.0, float(name == "coffee"), f"Share of {name}.", (0.0, 1.0))
             for name in INGREDIENTS
         ),
-    )
+    )  # fmt: skip
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
@@ -230,9 +239,10 @@ class ContentsControl(Control):
         angle = np.arange(COLUMNS) * 2.0 * np.pi / COLUMNS
         uvs = np.concatenate([[(0.5, 0.5)], 0.5 + 0.45 * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
         vertices = _surface(vessel, torch.tensor(0.5)).numpy()
-        mesh = replace(polygon(COLUMNS), vertices=vertices, uvs=uvs.astype(np.float32))
-        color = np.zeros((4, 4, 3), dtype=np.float32)
-        return scene.with_part(MeshPart(self.name, mesh, color, SURFACE, to_world=object_to_world(scene)))
+        mesh = replace(parts.polygon(COLUMNS), vertices=vertices, uvs=uvs.astype(np.float32))
+        black = np.zeros((4, 4, 3), dtype=np.float32)
+        pose = geometry.object_to_world(scene)
+        return scene.with_part(parts.MeshPart(self.name, mesh, black, SURFACE, to_world=pose))
 
     def fit(self) -> None:
         super().fit()
@@ -246,7 +256,7 @@ class ContentsControl(Control):
         return {**values, **self.proportions(values)}
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
-        return {name: measure(values[name], "1") for name in INGREDIENTS}
+        return {name: Value(value=float(values[name]), unit="1") for name in INGREDIENTS}
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         vessel = interior(self.scene.object)
@@ -256,13 +266,13 @@ class ContentsControl(Control):
         if "object.to_world" in so_far:
             inputs[f"{self.name}.to_world"] = so_far["object.to_world"]
         shares = torch.stack([values[name] for name in INGREDIENTS])
-        color = liquid(shares, torch.from_numpy(vessel.color).to(shares))
-        inputs[f"{self.name}.base_color"] = color.expand(4, 4, 3)
+        liquid_color = liquid(shares, torch.from_numpy(vessel.color).to(shares))
+        inputs[f"{self.name}.base_color"] = liquid_color.expand(4, 4, 3)
         return inputs
 
     # ---- proportions ------------------------------------------------------------------------------------------------
 
-    def spec(self, parameter: Parameter) -> Spec:
+    def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
         """An ingredient's coordinate is where the stick is cut, from 0 to 1 of what is possible there."""
         if parameter.name not in INGREDIENTS:
             return super().spec(parameter)

@@ -13,13 +13,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Control, Parameter, Values, named, number
+from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Control, Values
 from advsearch.controls.ranges import Fixed, Number, Range
 from advsearch.errors import InputError
 from advsearch.scene import library, settings
@@ -28,11 +28,12 @@ from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription, 
 from advsearch.scene.formation import metered_gain
 from advsearch.scene.geometry import real_harmonics
 from advsearch.scene.library import import_environment
-from advsearch.scene.settings import CHANNELS, LIT
+from advsearch.scene.settings import CHANNELS, Parameter
 
 COEFFICIENTS = 27  # degrees 0 to 2 of three colour channels
 MAPS = tuple(sorted({*library.list_environments()} - {*library.list_environments("place")}))
 """The bundled environments that are a map; the others are a place around the object."""
+_lit = partial(Parameter.number, Parameter.LIT)
 
 
 class EnvironmentControl(Control):
@@ -40,13 +41,14 @@ class EnvironmentControl(Control):
 
     kind = "environment"
     parameters = (
-        named("which", (OWN_MAP, *MAPS), OWN_MAP,
-              "Another environment instead of the scene's own, metered afresh: bundled, or a .hdr or .exr file."),
+        Parameter.named("which", (OWN_MAP, *MAPS), OWN_MAP,
+                        "Another environment instead of the scene's own, metered afresh: bundled, or a .hdr or .exr "
+                        "file."),
         *settings.ENVIRONMENT,
-        *(number(LIT, f"tint_{color}", "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.") for color in CHANNELS),
+        *(_lit(f"tint_{color}", "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.") for color in CHANNELS),
         Parameter("harmonics", (COEFFICIENTS,), "mean radiances", -1.0, 1.0, 0.0,
                   "Low-order light that is added: spherical-harmonic coefficients, 9 for each channel, inside the "
-                  "ball.", estimators=LIT),
+                  "ball.", estimators=Parameter.LIT),
     )  # fmt: skip
     choices = (Choice("epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients.", "epsilon",
                       "harmonics", most=100.0),)  # fmt: skip

@@ -13,13 +13,7 @@ from dataclasses import replace
 import numpy as np
 from torch import Tensor
 
-from advsearch.controls.base import Control, Parameter, Values, color_of, number
-from advsearch.controls.ranges import Number, Range
-from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.parts import HazePart
-from advsearch.scene.settings import CHANNELS, LIT, colors
+from advsearch.extend import Control, Parameter, Range, SceneDescription, Values, color, geometry, parts
 
 LEAST_RADIUS = 4.0  # the haze reaches at least this far from the scene's middle, object sizes
 BEHIND_CAMERA = 1.5  # it reaches at least so many times as far as the camera is away
@@ -32,38 +26,41 @@ class HazeControl(Control):
     kind = "haze"
     amount = "density"
     parameters = (
-        number(LIT, "density", "per object size", 0.0, 2.0, 0.0,
-               "Extinction: over 1 / density the haze takes 63 % of the light out of a ray.", (0.0, 0.3)),
-        *colors("of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02),
+        Parameter.number(Parameter.LIT, "density", "per object size", 0.0, 2.0, 0.0,
+                         "Extinction: over 1 / density the haze takes 63 % of the light out of a ray.", (0.0, 0.3)),
+        *Parameter.colors("of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02),
     )  # fmt: skip
 
     def in_scene(self, parameter: Parameter) -> Parameter:
         own, default = _haze_of(self.scene), parameter.default
         if parameter.name != "density":
-            color = None if own is None else linear_to_srgb(np.asarray(own.albedo, np.float32)).tolist()
-            return replace(parameter, default=color[CHANNELS.index(parameter.name)]) if color else parameter
+            if own is None:
+                return parameter
+            albedo = color.linear_to_srgb(np.asarray(own.albedo, np.float32)).tolist()
+            return replace(parameter, default=albedo[color.CHANNELS.index(parameter.name)])
         if own is not None:
             default = own.density
         elif self.asked and not self.searches("density"):
             default = THIN_HAZE
         spec = self.specs.get("density")
         adjoint = isinstance(spec, Range) and spec.low > 0.0
-        return replace(parameter, default=default, estimators=LIT if adjoint else ("differences",))
+        return replace(parameter, default=default, estimators=Parameter.LIT if adjoint else ("differences",))
 
-    def unchanged(self, parameter: Parameter) -> Number:
+    def unchanged(self, parameter: Parameter) -> float | str:
         return 0.0 if _haze_of(self.scene) is None else parameter.default  # of the density; see `amount`
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         if (own := _haze_of(scene)) is not None:
             renamed = replace(own, name=self.name)
             return replace(scene, parts=tuple(renamed if part is own else part for part in scene.parts))
-        away = float(np.linalg.norm(camera_to_world(scene)[:3, 3]))
-        return scene.with_part(HazePart(self.name, max(LEAST_RADIUS, BEHIND_CAMERA * away)))
+        away = float(np.linalg.norm(geometry.camera_to_world(scene)[:3, 3]))
+        return scene.with_part(parts.HazePart(self.name, max(LEAST_RADIUS, BEHIND_CAMERA * away)))
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        return {f"{self.name}.density": values["density"].reshape(1), f"{self.name}.albedo": color_of(values)}
+        albedo = color.combine_channels(values)
+        return {f"{self.name}.density": values["density"].reshape(1), f"{self.name}.albedo": albedo}
 
 
-def _haze_of(scene: SceneDescription) -> HazePart | None:
+def _haze_of(scene: SceneDescription) -> parts.HazePart | None:
     """The haze that a scene comes with."""
-    return next((part for part in scene.parts if isinstance(part, HazePart) and part.density), None)
+    return next((part for part in scene.parts if isinstance(part, parts.HazePart) and part.density), None)

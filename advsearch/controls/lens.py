@@ -15,10 +15,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Control, Parameter, Values, number
-from advsearch.controls.ranges import OneOf
-from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.settings import CHANNELS
+from advsearch.extend import Choice, Control, OneOf, Parameter, Values, color
 
 DOTS = 4  # how many dots there are when nothing is said
 MOST_DOTS = 64
@@ -45,10 +42,10 @@ class LensControl(Control):
         _per_dot("radius", "picture sizes", 0.12,
                  "Distance at which a dot has lost 63 % of its opacity, as a share of the picture's smaller side.",
                  (0.03, 0.25), 0.01, log=True),
-        *(_per_dot(color, "sRGB", 0.5, f"{color.capitalize()} of each dot.") for color in CHANNELS),
+        *(_per_dot(name, "sRGB", 0.5, f"{name.capitalize()} of each dot.") for name in color.CHANNELS),
         _per_dot("opacity", "1", 0.0, "Opacity in the middle of each dot; 0 is no dot.", (0.0, 0.5)),
-        number(("image",), "falloff", "1", 1.0, 8.0, 1.0,
-               "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc."),
+        Parameter.number(("image",), "falloff", "1", 1.0, 8.0, 1.0,
+                         "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc."),
     )  # fmt: skip
     choices = (Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}.", whole=(1, MOST_DOTS)),)
 
@@ -108,7 +105,8 @@ def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
     Returns:
         (H, W, 3) sRGB in [0, 1]; differentiable in the picture and in every value.
     """
-    shades = srgb_to_linear(torch.stack([values[color] for color in CHANNELS], dim=-1)).to(image.device)
+    levels = torch.stack([values[channel] for channel in color.CHANNELS], dim=-1)
+    shades = color.srgb_to_linear(levels).to(image.device)
     height, width = image.shape[:2]
     side, device, falloff = min(height, width), values["x"].device, values["falloff"]
     across = (torch.arange(width, device=device) + 0.5 - values["x"][:, None] * width) / side
@@ -117,7 +115,7 @@ def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
     distance = squared / values["radius"][:, None, None] ** 2
     reach = float(_FAR ** (1.0 / falloff.detach()))
     covers = values["opacity"][:, None, None] * torch.exp(-(distance.clamp(1e-12, reach) ** falloff))
-    covers, light = covers.to(image.device), srgb_to_linear(image)
+    covers, light = covers.to(image.device), color.srgb_to_linear(image)
     for cover, shade in zip(covers, shades, strict=True):
         light = light + cover[..., None] * (shade - light)
-    return linear_to_srgb(light)
+    return color.linear_to_srgb(light)

@@ -18,14 +18,15 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Control, Parameter, Values, color_of, number
+from advsearch.controls.base import Choice, Control, Values
 from advsearch.controls.ranges import Fixed, Number
 from advsearch.errors import InputError
+from advsearch.scene import color
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import WHITE, metered_gain
 from advsearch.scene.geometry import affine
 from advsearch.scene.parts import BallLamp, PointLamp
-from advsearch.scene.settings import LIT, colors, moving
+from advsearch.scene.settings import Parameter
 
 LIT_WHITE = 0.9  # linear display value of a white surface that faces a lamp of power 1 at distance 1
 LIT_POWER = 6.0
@@ -39,7 +40,7 @@ def metered_irradiance(scene: SceneDescription) -> float:
 
 
 def _place(name: str, low: float, high: float, default: float, description: str) -> Parameter:
-    return moving(("differences",), name, "object sizes", -1000.0, 1000.0, default, description, (low, high))
+    return Parameter.moving(("differences",), name, "object sizes", -1000.0, 1000.0, default, description, (low, high))
 
 
 class LightControl(Control):
@@ -51,12 +52,13 @@ class LightControl(Control):
         _place("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
         _place("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
         _place("z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."),
-        *colors("of the lamp's colour.", (0.6, 1.0)),
-        number(LIT, "power", "1", 0.0, 1000.0, 0.0,
-               "Irradiance at distance 1, in multiples of the one that shows a white surface just below white.",
-               (0.0, 12.0)),
-        moving(("differences",), "size", "object sizes", 0.001, 10.0, 0.2,
-               "Diameter of an area light; a point has none.", (0.05, 0.6), log=True),
+        *Parameter.colors("of the lamp's colour.", (0.6, 1.0)),
+        Parameter.number(Parameter.LIT, "power", "1", 0.0, 1000.0, 0.0,
+                         "Irradiance at distance 1, in multiples of the one that shows a white surface just below "
+                         "white.",
+                         (0.0, 12.0)),
+        Parameter.moving(("differences",), "size", "object sizes", 0.001, 10.0, 0.2,
+                         "Diameter of an area light; a point has none.", (0.05, 0.6), log=True),
     )  # fmt: skip
     choices = (Choice("type", "area",
                       "area (a ball that glows: soft shadows, visible) or point (sharp shadows, invisible).",
@@ -86,7 +88,7 @@ class LightControl(Control):
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         place = torch.stack([values[axis] for axis in ("x", "y", "z")])
-        intensity = color_of(values) * values["power"] * metered_irradiance(self.scene)
+        intensity = color.combine_channels(values) * values["power"] * metered_irradiance(self.scene)
         if self.chosen["type"] == "point":
             return {f"{self.name}.position": place, f"{self.name}.intensity": intensity}
         radius = values["size"] / 2.0

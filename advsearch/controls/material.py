@@ -18,14 +18,15 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from advsearch.controls.base import Control, Parameter, Values, color_of, named
+from advsearch.controls.base import Control, Values
 from advsearch.controls.ranges import Number
 from advsearch.errors import InputError
+from advsearch.scene import color
 from advsearch.scene.assets import Doubles, Floats, Material, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.raster import looked_up, rasterised
-from advsearch.scene.settings import CHANNELS, MATERIAL, colors
+from advsearch.scene.settings import CHANNELS, MATERIAL, Parameter
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Named materials made by procedure: seamless patterns with a surface of their own, and how they cover an object.
@@ -394,10 +395,10 @@ class MaterialControl(Control):
     kind = "material"
     of_a_mesh = True
     parameters = (
-        named("which", (OWN, *PATTERNS), OWN, "The object's own surface, or a named material in its place.",
-              estimators=("differences",)),
+        Parameter.named("which", (OWN, *PATTERNS), OWN, "The object's own surface, or a named material in its place.",
+                        estimators=("differences",)),
         *MATERIAL,
-        *colors("of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)),
+        *Parameter.colors("of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)),
     )  # fmt: skip
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
@@ -433,7 +434,7 @@ class MaterialControl(Control):
             elif self._names != (OWN,):
                 inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([float(getattr(material, name))])
         if self._colours():
-            mesh, tint = self.mesh_in(self.scene), color_of(values)
+            mesh, tint = self.mesh_in(self.scene), color.combine_channels(values)
             base = so_far.get(self._base_color)  # what the controls before made of the texture
             if which != OWN:
                 base = _linear_covering(mesh.mesh, which)

@@ -6,19 +6,25 @@ one. Whether Mitsuba's derivative is right nobody knows beforehand: `advsearch c
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Control, Moved, Parameter, Values
-from advsearch.controls.ranges import LARGEST, Fixed, OneOf, Slot
-from advsearch.errors import InputError
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.mitsuba_backend.writing import plugin_numbers
-from advsearch.scene.parts import PluginNumber, PluginNumbers
-from advsearch.scene.settings import CHANNELS
+from advsearch.extend import (
+    Control,
+    Fixed,
+    InputError,
+    OneOf,
+    Parameter,
+    Range,
+    SceneDescription,
+    Values,
+    color,
+    mitsuba_data,
+    parts,
+)
 
 
 class MitsubaControl(Control):
@@ -37,19 +43,21 @@ class MitsubaControl(Control):
         return tuple(_parameter(key) for key in settings)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        return scene.with_part(PluginNumbers(self.name, plugin_numbers(scene, self.name, tuple(self._given))))
+        return scene.with_part(
+            parts.PluginNumbers(self.name, mitsuba_data.plugin_numbers(scene, self.name, tuple(self._given)))
+        )
 
-    def laid_out(self) -> Iterator[Slot]:
+    def laid_out(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
         for number in self._numbers():
             whole = self.specs.get(number.key)
             if isinstance(whole, OneOf) and len(number.values) > 1:
                 raise InputError(
                     f"`controls` {self.name}:{number.key}: expected a range, because it is a colour; values one by one "
-                    f"are for one channel, such as {self.name}:{number.key}.{CHANNELS[0]}"
+                    f"are for one channel, such as {self.name}:{number.key}.{color.CHANNELS[0]}"
                 )
             for parameter, value in zip(_channels(number), number.values, strict=True):
                 spec = self.specs.get(parameter.name, whole or Fixed(value))
-                yield Slot(replace(parameter, default=value), spec)
+                yield replace(parameter, default=value), spec
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {
@@ -57,18 +65,22 @@ class MitsubaControl(Control):
             for number in self._numbers()
         }
 
-    def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:
-        return super().left_out([slot for slot in slots if slot.width])
+    def is_compared(self, parameter: Parameter, spec: Fixed | Range | OneOf) -> bool:
+        return not isinstance(spec, Fixed)
 
-    def _numbers(self) -> tuple[PluginNumber, ...]:
-        return next(one.numbers for one in self.scene.parts if isinstance(one, PluginNumbers) and one.name == self.name)
+    def _numbers(self) -> tuple[parts.PluginNumber, ...]:
+        return next(
+            one.numbers for one in self.scene.parts if isinstance(one, parts.PluginNumbers) and one.name == self.name
+        )
 
 
 def _parameter(key: str, valid: tuple[str, ...] = ("differences",)) -> Parameter:
-    return Parameter(key, (), "1", -LARGEST, LARGEST, "the scene's own", f"Mitsuba's {key}.", estimators=valid)
+    return Parameter(
+        key, (), "1", -Parameter.LARGEST, Parameter.LARGEST, "the scene's own", f"Mitsuba's {key}.", estimators=valid
+    )
 
 
-def _channels(one: PluginNumber) -> list[Parameter]:
+def _channels(one: parts.PluginNumber) -> list[Parameter]:
     """A parameter for each number."""
-    names = [f"{one.key}.{channel}" for channel in CHANNELS] if len(one.values) > 1 else [one.key]
+    names = [f"{one.key}.{channel}" for channel in color.CHANNELS] if len(one.values) > 1 else [one.key]
     return [_parameter(name, one.valid) for name in names]

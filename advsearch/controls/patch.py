@@ -14,7 +14,7 @@ plane, unrolled along the direction in which the surface bends (exact for cylind
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -24,20 +24,21 @@ import torch.nn.functional as F
 from scipy import spatial
 from torch import Tensor
 
-from advsearch.controls.base import LARGEST_EPSILON, Choice, Moved, Values, number
-from advsearch.controls.corruption_filters import planes, resized
-from advsearch.controls.ranges import Fixed, OneOf, Range, Slot
-from advsearch.controls.support.images import PRINT_SIDE, enlarged, resampled
-from advsearch.controls.support.norms import radius
-from advsearch.controls.support.picture_control import PictureControl
-from advsearch.errors import InputError
-from advsearch.scene.assets import Doubles, Mesh
-from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import camera_to_world, object_to_world
-from advsearch.scene.gradients import WHOLE_RANGE, Budget
-from advsearch.scene.raster import MeshSurface, rasterised
-from advsearch.scene.settings import LIT, Parameter
+from advsearch.extend import (
+    Choice,
+    Fixed,
+    InputError,
+    OneOf,
+    Parameter,
+    PictureControl,
+    Range,
+    SceneDescription,
+    Values,
+    color,
+    geometry,
+    images,
+    parts,
+)
 
 BASE_COLOR = "object.base_color"
 NORMS = ("box", "linf", "l2")
@@ -60,13 +61,14 @@ class PatchControl(PictureControl):
         Parameter("pixels", (None, None, 3), "sRGB", 0.0, 1.0, "the object's own texture underneath",
                   "Display-referred colours of the patch; a narrower range is a printer's gamut.", search=(0.0, 1.0),
                   estimators=("adjoint",)),
-        number(("differences",), "azimuth", "degrees", 0.0, 360.0, "towards the camera",
-               "Side of the object that the patch is on.", periodic=True),
-        number(("differences",), "height", "1", 0.0, 1.0, "towards the camera",
-               "Where it is from the middle of the underside (0) over the sides (0.5) to the middle of the top (1)."),
-        number(LIT, "size", "object sizes", 0.05, 0.6, 0.3, "Side of the patch.", log=True),
-        number(LIT, "rotation", "degrees", -180.0, 180.0, 0.0,
-               "Turn of the patch on the surface, counter-clockwise; upright at 0.", periodic=True),
+        Parameter.number(("differences",), "azimuth", "degrees", 0.0, 360.0, "towards the camera",
+                         "Side of the object that the patch is on.", periodic=True),
+        Parameter.number(("differences",), "height", "1", 0.0, 1.0, "towards the camera",
+                         "Where it is from the middle of the underside (0) over the sides (0.5) to the middle of the "
+                         "top (1)."),
+        Parameter.number(Parameter.LIT, "size", "object sizes", 0.05, 0.6, 0.3, "Side of the patch.", log=True),
+        Parameter.number(Parameter.LIT, "rotation", "degrees", -180.0, 180.0, 0.0,
+                         "Turn of the patch on the surface, counter-clockwise; upright at 0.", periodic=True),
     )  # fmt: skip
     choices = (
         Choice("resolution", 32, "Side of the patch in pixels.", whole=(2, 512)),
@@ -74,7 +76,7 @@ class PatchControl(PictureControl):
                "How far pixels may go: box (anywhere), linf (the default with an epsilon) or l2 (a ball around what "
                "is underneath).", "norm", "pixels", options=NORMS),
         Choice("epsilon", None, "Radius of that ball, display-referred; by default 0.1 a pixel value.", "epsilon",
-               "pixels", most=LARGEST_EPSILON),
+               "pixels", most=PictureControl.LARGEST_EPSILON),
         Choice("picture", None, "A picture file to stick on as it is; then pixels are not searched.", fixes="pixels"),
     )  # fmt: skip
 
@@ -112,15 +114,6 @@ class PatchControl(PictureControl):
             return super().in_scene(parameter)
         return replace(parameter, default=towards_camera(self.scene)[parameter.name == "height"])
 
-    def budget_of(self, parameter: Parameter) -> Budget:
-        norm = self.chosen["norm"]
-        if parameter.name != "pixels" or norm == "box":
-            return WHOLE_RANGE
-        spec = self.spec(parameter)
-        assert isinstance(spec, Range)
-        reach = radius(norm, self.chosen["epsilon"], 3 * math.prod(self.sides))
-        return Budget(norm, reach / (spec.high - spec.low))
-
     def fit(self) -> None:
         super().fit()
         if not self.groups:
@@ -129,19 +122,18 @@ class PatchControl(PictureControl):
                 f"a range, such as {self.name}={{azimuth: [0, 360]}}"
             )
         side, pixels, picture = self.sides[0], self.slots[0], self.read_picture()
-        self._picture = None if picture is None else resampled(picture, side)
+        self._picture = None if picture is None else images.resampled(picture, side)
         resting = {name: float(value) for name, value in self.values(self.start).items() if name != "pixels"}
         self._sticker = Sticker(self.scene, resting, side)
         if isinstance(pixels.spec, Range):
             low, high = pixels.spec.low, pixels.spec.high
             wanted = (self._sticker.underneath() - low) / (high - low)
             self.start[: pixels.width] = wanted.clamp(0.0, 1.0).reshape(-1)
-            moved = not torch.allclose(wanted.clamp(0.0, 1.0), wanted, atol=1e-5)
-            nearest = f"the nearest {pixels.spec}"
-            self.moved = (Moved(self.name, f"{self.name}.pixels", "sRGB", "the texture underneath", nearest),) * moved
+            if not torch.allclose(wanted.clamp(0.0, 1.0), wanted, atol=1e-5):
+                self.note_moved(pixels.parameter, "the texture underneath", f"the nearest {pixels.spec}")
 
-    def left_out(self, slots: Sequence[Slot]) -> Iterator[Moved]:
-        return super().left_out(() if self.free else slots[1:])  # at the start searched pixels show no patch
+    def is_compared(self, parameter: Parameter, spec: Fixed | Range | OneOf) -> bool:
+        return not self.free and parameter.name != "pixels"  # at the start searched pixels show no patch
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {BASE_COLOR: self._sticker.paint(so_far.get(BASE_COLOR), values["pixels"], values)}
@@ -151,7 +143,7 @@ class PatchControl(PictureControl):
 
     def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         pixels = values["pixels"]
-        return {self.name: enlarged(pixels, -(-PRINT_SIDE // len(pixels))), f"{self.name}-pixels": pixels}
+        return {self.name: images.enlarged(pixels, -(-images.PRINT_SIDE // len(pixels))), f"{self.name}-pixels": pixels}
 
 
 # ---- on the surface --------------------------------------------------------------------------------------------------
@@ -160,13 +152,13 @@ class PatchControl(PictureControl):
 def towards_camera(scene: SceneDescription) -> tuple[float, float]:
     """Return azimuth (degrees) and height (0 to 1) of the place in the middle of the object as the camera sees it."""
     middle, radius, half = _shape(scene.object.mesh)
-    camera = camera_to_world(scene)[:3, 3]
-    x, y, z = np.linalg.solve(object_to_world(scene), np.append(camera, 1.0))[:3] - middle
+    camera = geometry.camera_to_world(scene)[:3, 3]
+    x, y, z = np.linalg.solve(geometry.object_to_world(scene), np.append(camera, 1.0))[:3] - middle
     lift = math.atan2(z * radius, max(math.hypot(x, y), 1e-12) * half)
     return math.degrees(math.atan2(y, x)) % 360.0, 0.5 + lift / math.pi
 
 
-def _shape(mesh: Mesh) -> tuple[Doubles, float, float]:
+def _shape(mesh: parts.Mesh) -> tuple[parts.Doubles, float, float]:
     """Middle (3,) of a mesh, its largest half-width and its half-height."""
     low, high = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
     half = np.maximum((high - low) / 2.0, 1e-6)
@@ -195,16 +187,16 @@ class Sticker:
             )
         self._shape = _shape(mesh)
         self._resting, self._side = resting, side
-        self._surface = MeshSurface(mesh)
-        own = srgb_to_linear(torch.from_numpy(scene.object.base_color.copy()))
+        self._surface = images.MeshSurface(mesh)
+        own = color.srgb_to_linear(torch.from_numpy(scene.object.base_color.copy()))
         smallest, largest = BASE_SIDES
         least = wanted = max(smallest, *own.shape[:2])  # sides of a map whose texels are smaller than the pixels
-        charts = rasterised(mesh, least)
+        charts = images.rasterised(mesh, least)
         areas = charts.areas()
         spacing = math.sqrt(float(np.median(areas[areas > 0.0])))
         while 2 * wanted <= largest and spacing * least / wanted > resting["size"] / side:
             wanted *= 2
-        charts = charts if wanted == least else rasterised(mesh, wanted)
+        charts = charts if wanted == least else images.rasterised(mesh, wanted)
         self._own = _fitted(own, len(charts.face))
         mask = charts.touched
         self._texels, self._faces = np.flatnonzero(mask), charts.face[mask]
@@ -226,11 +218,11 @@ class Sticker:
         edge = (0.5 - across.abs().amax(dim=1)) * size / (EDGE_TEXELS * spot.spacing) + 0.5
         cover = (spot.cover.to(device) * _smooth(edge))[:, None]
         grid = (across * across.new_tensor([2.0, -2.0]))[None, None]
-        linear = planes(srgb_to_linear(pixels))
-        color = F.grid_sample(linear, grid, mode="bilinear", padding_mode="border", align_corners=False)[0, :, 0].T
+        linear = images.planes(color.srgb_to_linear(pixels))
+        ink = F.grid_sample(linear, grid, mode="bilinear", padding_mode="border", align_corners=False)[0, :, 0].T
         flat = base.reshape(-1, 3)
         under = flat.index_select(0, texels)
-        return flat.index_copy(0, texels, under + cover * (color - under)).reshape(base.shape)
+        return flat.index_copy(0, texels, under + cover * (ink - under)).reshape(base.shape)
 
     def underneath(self) -> Tensor:
         """Return what the object's own texture shows where the patch starts, as a patch (n, n, 3) sRGB."""
@@ -240,17 +232,17 @@ class Sticker:
         inside = (across.abs().amax(dim=1) < 0.5) & (spot.cover > 0.0)
         if not bool(inside.any()):
             return torch.full((side, side, 3), 0.5)
-        color = self._own.reshape(-1, 3)[spot.texels[inside]]
+        own_color = self._own.reshape(-1, 3)[spot.texels[inside]]
         place = across[inside] * torch.tensor([1.0, -1.0]) + 0.5
         column, row = (place * side).long().clamp(0, side - 1).T
         index = row * side + column
-        sums = torch.zeros(side * side, 3).index_add(0, index, color)
+        sums = torch.zeros(side * side, 3).index_add(0, index, own_color)
         counts = torch.zeros(side * side).index_add(0, index, torch.ones(len(index)))
         colors = sums / counts.clamp_min(1.0)[:, None]
         centres = torch.stack(torch.meshgrid(*[torch.arange(side) + 0.5] * 2, indexing="ij"), dim=-1).reshape(-1, 2)
         nearest = spatial.cKDTree(place.flip(1).numpy()).query(centres.numpy() / side)[1]
-        colors = torch.where(counts[:, None] > 0.0, colors, color[torch.from_numpy(nearest)])
-        return linear_to_srgb(colors).reshape(side, side, 3)
+        colors = torch.where(counts[:, None] > 0.0, colors, own_color[torch.from_numpy(nearest)])
+        return color.linear_to_srgb(colors).reshape(side, side, 3)
 
     def _find_spot(self, azimuth: float, height: float, size: float) -> Spot:
         middle, radius, half = self._shape
@@ -285,7 +277,7 @@ class Sticker:
         )
 
 
-def _frame(normal: Doubles, upwards: Doubles) -> Doubles:
+def _frame(normal: parts.Doubles, upwards: parts.Doubles) -> parts.Doubles:
     """Rows right, up, normal (3, 3) of a right-handed frame with `up` as near to a direction as the normal lets it."""
     up = upwards - float(upwards @ normal) * normal
     if float(np.linalg.norm(up)) < 1e-6:
@@ -295,7 +287,9 @@ def _frame(normal: Doubles, upwards: Doubles) -> Doubles:
     return np.stack([np.cross(up, normal), up, normal])
 
 
-def unrolled(offsets: Doubles, normals: Doubles, frame: Doubles) -> tuple[Doubles, Doubles]:
+def unrolled(
+    offsets: parts.Doubles, normals: parts.Doubles, frame: parts.Doubles
+) -> tuple[parts.Doubles, parts.Doubles]:
     """Return coordinates (N, 2) of points along a surface, to the right and upwards, and normals' cosines (N,).
 
     In the tangent plane a point of a circle of radius R lies at `R sin(phi)` where its arc is `R phi`, phi being the
@@ -327,4 +321,4 @@ def _smooth(share: Tensor) -> Tensor:
 
 def _fitted(base: Tensor, side: int) -> Tensor:
     """Resize a base colour (h, w, 3) to (side, side, 3); differentiable."""
-    return resized(base, side, side, antialias=max(base.shape[:2]) > side)
+    return images.resized(base, side, side, antialias=max(base.shape[:2]) > side)

@@ -14,12 +14,11 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Control, Parameter, Values
-from advsearch.controls.support.rotations import euler, rotation_vector
+from advsearch.controls.base import Choice, Control, Values
 from advsearch.errors import InputError
-from advsearch.scene.geometry import affine, standing
+from advsearch.scene.geometry import affine, euler, rotation_vector, standing
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.settings import GEOMETRIC, POSE
+from advsearch.scene.settings import POSE, Parameter
 
 
 class PoseControl(Control):
@@ -30,7 +29,7 @@ class PoseControl(Control):
     parameters = (
         *POSE[:3],
         Parameter("rotation", (3,), "degrees", -180.0, 180.0, 0.0, "Rotation vector on top of the angles.",
-                  moves_silhouettes=True, estimators=GEOMETRIC),
+                  moves_silhouettes=True, estimators=Parameter.GEOMETRIC),
         *POSE[3:],
     )  # fmt: skip
     choices = (

@@ -27,8 +27,6 @@ from advsearch.scene.settings import Parameter
 
 Number = float | str
 
-LARGEST = 1e30  # no quantity of a scene is larger; the square of one that is has no float32
-
 Quantiles = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 COMMON = ("norm", "truncnorm", "uniform", "triang", "beta", "lognorm", "expon", "gamma", "vonmises")
@@ -41,11 +39,6 @@ MOST_OUTSIDE = 0.01  # probability outside of a parameter's bounds, where a dist
 CHECKED = 257  # shares at which a function from Python is looked at
 
 NEAR = 1e-4  # half of the step over which the slope of a quantile is taken
-
-
-def is_number(given: object) -> TypeGuard[float]:
-    """Return whether it is a number that float32 has: not a truth value, not NaN, and at most `LARGEST`."""
-    return isinstance(given, (int, float)) and not isinstance(given, bool) and abs(given) <= LARGEST
 
 
 @dataclass(frozen=True)
@@ -202,7 +195,7 @@ MOST_SHARES = 1000  # equal shares of probability that weights are rounded to, a
 def _weighted(where: str, values: Sequence[Number], weights: object) -> OneOf:
     """A choice that has each value as often as its weight says, so that equal shares of u draw it so."""
     given = list(weights) if isinstance(weights, (list, tuple)) else []
-    numbers = [weight for weight in given if is_number(weight) and weight >= 0.0]
+    numbers = [weight for weight in given if Parameter.is_number(weight) and weight >= 0.0]
     if not len(numbers) == len(given) == len(values) or not sum(numbers):
         raise InputError(
             f"{where}: expected a weight of at least 0 for each of {len(values)} values, and one over 0, got "
@@ -239,7 +232,7 @@ def _value(where: str, parameter: Parameter, given: object) -> Number:
         return given
     if isinstance(given, bool) or not isinstance(given, (int, float)):
         raise InputError(f"{where}: expected a number in {parameter.unit}, got {given!r}")
-    if not (is_number(given) and parameter.low <= given <= parameter.high):
+    if not (Parameter.is_number(given) and parameter.low <= given <= parameter.high):
         raise InputError(
             f"{where}: expected a number from {parameter.low:g} to {parameter.high:g} ({parameter.unit}), "
             f"got {shown(given)}"
@@ -274,7 +267,7 @@ def nearest(value: float, low: float, high: float, *, turns: bool = False) -> fl
 
 def shown(value: Number) -> str:
     """A value as it is written."""
-    if isinstance(value, int) and not is_number(value):
+    if isinstance(value, int) and not Parameter.is_number(value):
         return f"a whole number of {value.bit_length()} bits"
     return value if isinstance(value, str) else f"{value:g}"
 
@@ -347,10 +340,12 @@ def read_drawn(where: str, parameter: Parameter, given: Mapping[str, object]) ->
         raise UnknownNameError(
             f"distribution of {where}", str(name), COMMON, "It is one of scipy.stats, of real numbers."
         )
-    shown = (f"{key}={value:g}" if is_number(value) else f"{key}={value!r:.20}" for key, value in numbers.items())
+    shown = (
+        f"{key}={value:g}" if Parameter.is_number(value) else f"{key}={value!r:.20}" for key, value in numbers.items()
+    )
     text = f"{name}({', '.join(shown)})"
     try:
-        if not all(map(is_number, numbers.values())):
+        if not all(map(Parameter.is_number, numbers.values())):
             raise TypeError("expected numbers")
         frozen = family(**numbers)
         sound = np.isfinite(frozen.ppf(0.5))

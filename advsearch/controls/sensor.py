@@ -22,15 +22,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Control, Values, number
-from advsearch.controls.corruption_filters import drawn, picture, planes, warped
-from advsearch.controls.support.images import coded
-from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.extend import Choice, Control, Parameter, Values, color, images
 
 _DARK = 1e-6  # keeps the slope of a square root finite in black
 
 
-_image = partial(number, ("image",))
+_image = partial(Parameter.number, ("image",))
 
 
 class SensorControl(Control):
@@ -48,8 +45,8 @@ class SensorControl(Control):
                "Share of the picture that goes through a Bayer mosaic; 1 is a real camera.", (0.0, 1.0)),
         _image("red", "stops", -1.0, 1.0, 0.0, "White balance: red is this much brighter.", (-0.5, 0.5)),
         _image("blue", "stops", -1.0, 1.0, 0.0, "White balance: blue is this much brighter.", (-0.5, 0.5)),
-        number((), "compression", "1", 0.0, 95.0, 0.0, "0 is no file; above, a JPEG file of quality 100 less this.",
-               (0.0, 60.0)),
+        Parameter.number((), "compression", "1", 0.0, 95.0, 0.0,
+                         "0 is no file; above, a JPEG file of quality 100 less this.", (0.0, 60.0)),
     )  # fmt: skip
     choices = (Choice("seed", 0, "Which draw of the noise: a whole number from 0.", whole=(0, 2**32 - 1)),)
 
@@ -70,16 +67,16 @@ def through_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -
         derivative is that of the picture before it.
     """
     height, width = image.shape[:2]
-    light = srgb_to_linear(image) * vignette(height, width, values["vignetting"]).to(image.device)
+    light = color.srgb_to_linear(image) * vignette(height, width, values["vignetting"]).to(image.device)
     light = aberrated(light, values["aberration"])
     variance = values["shot"] ** 2 * light + values["read"] ** 2
     spread = torch.sqrt(variance + _DARK**2) - _DARK
-    light = light + spread * drawn(height, width, seed, "sensor").to(light)
+    light = light + spread * images.drawn(height, width, seed, "sensor").to(light)
     light = light + values["mosaic"] * (demosaiced(light) - light)
     gains = torch.stack([2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]])
-    seen = linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
+    seen = color.linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
     compression = round(float(values["compression"].detach()))
-    return coded(seen, 100 - compression).clamp(0.0, 1.0) if compression else seen
+    return images.coded(seen, 100 - compression).clamp(0.0, 1.0) if compression else seen
 
 
 def vignette(height: int, width: int, amount: Tensor) -> Tensor:
@@ -98,7 +95,8 @@ def aberrated(image: Tensor, amount: Tensor) -> Tensor:
     )
     outwards = torch.stack([across, down], dim=-1).to(image)
     red, blue = (
-        warped(image[..., k : k + 1], outwards * (1.0 / (1.0 + sign * amount) - 1.0)) for k, sign in ((0, 1), (2, -1))
+        images.warped(image[..., k : k + 1], outwards * (1.0 / (1.0 + sign * amount) - 1.0))
+        for k, sign in ((0, 1), (2, -1))
     )
     return torch.cat([red, image[..., 1:2], blue], dim=-1)
 
@@ -110,6 +108,6 @@ def demosaiced(light: Tensor) -> Tensor:
     red, blue = (1 - rows) * (1 - columns), rows * columns
     kept = torch.stack([red, 1 - red - blue, blue], dim=-1).to(light)
     kernel = light.new_tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]).expand(3, 1, 3, 3)
-    total = F.conv2d(planes(light * kept), kernel, padding=1, groups=3)
-    weight = F.conv2d(planes(kept), kernel, padding=1, groups=3)
-    return torch.where(kept > 0.0, light, picture(total / weight.clamp_min(1e-6)))
+    total = F.conv2d(images.planes(light * kept), kernel, padding=1, groups=3)
+    weight = F.conv2d(images.planes(kept), kernel, padding=1, groups=3)
+    return torch.where(kept > 0.0, light, images.picture(total / weight.clamp_min(1e-6)))

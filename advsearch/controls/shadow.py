@@ -19,15 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure
-from advsearch.controls.support.meshes import polygon
-from advsearch.controls.support.visibility import SURROUNDINGS, camera_in, put_away
-from advsearch.scene.assets import Doubles, Material
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import arriving
-from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middle
-from advsearch.scene.parts import MeshPart
-from advsearch.scene.settings import moving
+from advsearch.extend import Choice, Control, Parameter, SceneDescription, Value, Values, geometry, parts
 
 SMALLEST = 0.01  # a smaller card is put away
 FARTHEST, STEPS = 8.0, 12
@@ -36,7 +28,7 @@ BELOW_LAMP = 0.7  # where it is at most on the way to a lamp
 LOW = 5.0  # degrees above the ground that light counts from: lower, the card would stand on it
 
 
-_moving = partial(moving, ("differences",))
+_moving = partial(Parameter.moving, ("differences",))
 
 
 class ShadowControl(Control):
@@ -44,7 +36,7 @@ class ShadowControl(Control):
 
     kind = "shadow"
     amount = "size"
-    refines = frozenset(SURROUNDINGS)  # none is changed; but it comes after whatever moves the camera
+    refines = frozenset(geometry.SURROUNDINGS)  # none is changed; but it comes after whatever moves the camera
     parameters = (
         _moving("x", "object sizes", -10.0, 10.0, 0.0, "Shift of the shadow to the right, seen from the light.",
                 (-0.5, 0.5)),
@@ -65,9 +57,9 @@ class ShadowControl(Control):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         texel = np.full((2, 2, 3), 0.1, dtype=np.float32)
-        away = put_away(torch.from_numpy(camera_to_world(scene))).numpy()
-        card = polygon(int(self.chosen["corners"]))
-        return scene.with_part(MeshPart(self.name, card, texel, Material(roughness=1.0), to_world=away))
+        away = geometry.put_away(torch.from_numpy(geometry.camera_to_world(scene))).numpy()
+        card = parts.polygon(int(self.chosen["corners"]))
+        return scene.with_part(parts.MeshPart(self.name, card, texel, parts.Material(roughness=1.0), to_world=away))
 
     def in_scene(self, parameter: Parameter) -> Parameter:
         x, y, z = strongest_light(self.scene)[0]
@@ -82,28 +74,34 @@ class ShadowControl(Control):
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         radii = values["radii"]
-        rim = torch.from_numpy(polygon(len(radii)).vertices[1:].copy()).to(radii)
+        rim = torch.from_numpy(parts.polygon(len(radii)).vertices[1:].copy()).to(radii)
         offsets = torch.cat([torch.zeros(1, 3).to(radii), rim * (radii[:, None] - 1.0)])
         far = self._distance(values, so_far)
         if far is None:
-            pose = put_away(camera_in(self.scene, so_far).to(radii))
+            pose = geometry.put_away(geometry.camera_in(self.scene, so_far).to(radii))
         else:
             right, up, outwards = torch.from_numpy(self._axes(values)).to(values["x"])
             turn, size = torch.deg2rad(values["turn"]), values["size"].clamp_min(SMALLEST)
             along = torch.cos(turn) * right + torch.sin(turn) * up
             across = torch.cos(turn) * up - torch.sin(turn) * right
-            place = torch.from_numpy(middle(self.scene)).to(right) + far * outwards
+            place = torch.from_numpy(geometry.middle(self.scene)).to(right) + far * outwards
             place = place + values["x"] * right + values["y"] * up
-            pose = affine(size * torch.stack([along, -across, -outwards], dim=1), place)
+            pose = geometry.affine(size * torch.stack([along, -across, -outwards], dim=1), place)
         return {f"{self.name}.to_world": pose, f"{self.name}.offsets": offsets}
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         far = self._distance(values, so_far)
-        return {"true_distance": measure(0.0 if far is None else far, "object sizes, 0 where it is put away")}
+        return {
+            "true_distance": Value(
+                value=float(0.0 if far is None else far), unit="object sizes, 0 where it is put away"
+            )
+        }
 
-    def _axes(self, values: Values) -> Doubles:
+    def _axes(self, values: Values) -> parts.Doubles:
         """Rows: to the right and upwards as seen from the light, and towards it."""
-        left, up, outwards = camera_axes(float(values["azimuth"].detach()), float(values["elevation"].detach()), 0.0)
+        left, up, outwards = geometry.camera_axes(
+            float(values["azimuth"].detach()), float(values["elevation"].detach()), 0.0
+        )
         return np.stack([-left, up, outwards])
 
     def _distance(self, values: Values, so_far: Mapping[str, Tensor]) -> float | None:
@@ -114,7 +112,7 @@ class ShadowControl(Control):
             return None
         right, up, outwards = self._axes(values)
         aside = x * right + y * up
-        camera = camera_in(self.scene, so_far).detach().double().cpu().numpy()
+        camera = geometry.camera_in(self.scene, so_far).detach().double().cpu().numpy()
         model, aspect = self.scene.camera_model, self.scene.aspect
         fov, shift = so_far.get("camera.fov"), so_far.get("camera.shift")
         if model is not None:
@@ -126,7 +124,7 @@ class ShadowControl(Control):
         _, lamp = strongest_light(self.scene)
         for share in np.geomspace(1.0, FARTHEST, STEPS):
             far = min(asked * share, BELOW_LAMP * lamp)
-            way = (middle(self.scene) + far * outwards + aside - camera[:3, 3]) @ camera[:3, :3]
+            way = (geometry.middle(self.scene) + far * outwards + aside - camera[:3, 3]) @ camera[:3, :3]
             away = float(np.linalg.norm(way))
             if away > size and math.acos(min(max(way[2] / away, -1.0), 1.0)) - math.asin(size / away) >= corner:
                 return float(far)
@@ -134,17 +132,17 @@ class ShadowControl(Control):
 
 
 @lru_cache(maxsize=8)
-def strongest_light(scene: SceneDescription) -> tuple[Doubles, float]:
+def strongest_light(scene: SceneDescription) -> tuple[parts.Doubles, float]:
     """Return the unit way (3,) from the object's middle to what puts most light on a surface that faces it, and how far
     that is: a lamp, or the brightest place of the environment above the ground, infinitely far."""
     found, far, most = np.array([0.0, 0.0, 1.0]), math.inf, 0.0
-    directions, _, power = arriving(scene)
+    directions, _, power = scene.list_environment_light()
     above = directions[:, 2] >= math.sin(math.radians(LOW))
     if above.any():
         strength = np.where(above, power.mean(axis=1), 0.0)
         found, most = directions[int(strength.argmax())], float(strength.max())
     for lamp in scene.lamps.values():
-        way, lit = lamp.lighting(middle(scene))
+        way, lit = lamp.lighting(geometry.middle(scene))
         if float(lit.mean()) > most and way[2] > 0.0:
             far = float(np.linalg.norm(way))
             found, most = way / far, float(lit.mean())

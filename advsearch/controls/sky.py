@@ -15,18 +15,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Control, Values, number
-from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.mitsuba_backend.parts import sunsky_tables
-from advsearch.scene.settings import LIT
+from advsearch.extend import Choice, Control, Parameter, SceneDescription, Values, color, mitsuba_data, parts
 
 ROWS, COLUMNS = 256, 512  # size of the map
 SUN_RADIUS = math.radians(1.5)  # radius of the sun in the map, radians; half of its light comes from within 0.7 degrees
@@ -40,7 +35,7 @@ NEARLY_NOTHING = 1e-12
 @cache
 def tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Return what the two models interpolate, see `sunsky_tables`; read once per process and device."""
-    radiance, level, sun = sunsky_tables()
+    radiance, level, sun = mitsuba_data.sunsky_tables()
     return radiance.to(device), level.to(device), sun.to(device)
 
 
@@ -145,6 +140,7 @@ def angle_between(directions: Tensor, towards: Tensor) -> Tensor:
 
 METERED_IRRADIANCE = 0.9 * math.pi / 0.8
 """`M`: the irradiance on what faces the sun, the same for every sky that is metered."""
+_by_differences = partial(Parameter.number, ("differences",))
 
 
 class SkyControl(Control):
@@ -152,12 +148,12 @@ class SkyControl(Control):
 
     kind = "sky"
     parameters = (
-        number(("differences",), "azimuth", "degrees", -3600.0, 3600.0, 90.0,
-               "Direction of the sun about the vertical; 0 is +x.", (0.0, 360.0), periodic=True),
-        number(("differences",), "elevation", "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.",
-               (5.0, 85.0)),
-        number(LIT, "turbidity", "1", *TURBIDITIES, 3.0,
-               "How much the air scatters: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.", (2.0, 8.0)),
+        _by_differences("azimuth", "degrees", -3600.0, 3600.0, 90.0,
+                        "Direction of the sun about the vertical; 0 is +x.", (0.0, 360.0), periodic=True),
+        _by_differences("elevation", "degrees", 2.0, 90.0, 45.0, "Height of the sun above the horizon.",
+                        (5.0, 85.0)),
+        Parameter.number(Parameter.LIT, "turbidity", "1", *TURBIDITIES, 3.0,
+                         "How much the air scatters: 2 is very clear, 3 clear, 6 warm and moist, 10 hazy.", (2.0, 8.0)),
     )  # fmt: skip
     choices = (Choice("exposure", "metered",
                       "metered (each sky anew, as an automatic camera does) or fixed (at the start).",
@@ -166,7 +162,7 @@ class SkyControl(Control):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         bound = self.bind(scene)
         radiance = bound.radiance(bound.values(bound.start)).numpy().astype(np.float32)
-        sky = EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
+        sky = parts.EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
         return replace(scene, environment=sky).with_values(environment__rotation=0.0, environment__exposure=0.0)
 
     def fit(self) -> None:
@@ -189,4 +185,4 @@ class SkyControl(Control):
 @lru_cache(maxsize=4)
 def sky_over(ground: tuple[float, ...], device: torch.device) -> Sky:
     """Return the sky over a ground of an sRGB colour: far away it is made of the same as the ground plane."""
-    return Sky(srgb_to_linear(torch.tensor(ground)).to(device))
+    return Sky(color.srgb_to_linear(torch.tensor(ground)).to(device))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from advsearch.controls.base import NOTHING, Control, Group, Moved, Value
+from advsearch.controls.base import NOTHING, Control, Group, Moved, Value, file_name
 from advsearch.copies import is_ours
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
@@ -271,8 +271,3 @@ def _check_inputs(control: str, inputs: object) -> None:
                 f"`controls` {control}: {name}: expected {wanted} (linear, for a colour), got {least:.4g} to {most:.4g}"
                 f"{hint}"
             )
-
-
-def file_name(name: str) -> str:
-    """Return a control's name as it stands in names of files: texture@chair of texture:chair."""
-    return name.replace(":", "@")

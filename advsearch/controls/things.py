@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
 from typing import NamedTuple
 
@@ -20,29 +20,33 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Control, Parameter, Value, Values, measure, named
-from advsearch.controls.ranges import Slot
-from advsearch.controls.support.rotations import euler
-from advsearch.controls.support.visibility import camera_in
-from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.assets import Doubles
-from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.geometry import affine, middle, standing
-from advsearch.scene.parts import Footprint, MeshPart
-from advsearch.scene.settings import ORBIT, moving
-from advsearch.scene.things import blocked, footprint, ground_height
+from advsearch.extend import (
+    Control,
+    Fixed,
+    InputError,
+    OneOf,
+    Parameter,
+    Range,
+    SceneDescription,
+    UnknownNameError,
+    Value,
+    Values,
+    geometry,
+    parts,
+)
 
 GAP = 0.01  # metres between a thing that was moved away and what it would have stood in
 CAMERA, NEAR = 0.3, 0.05
 """Metres around the camera that stay free of what is as high; at most that share of its distance to the object."""
 EIGHTHS = np.arange(8) * np.pi / 4.0
 AWAY, SUNK = 1e-5, 0.01  # size of a thing that is away, and how many metres it lies in the ground
+_moving = partial(Parameter.moving, Parameter.ORBIT)
 
 
 class Stand(NamedTuple):
     """Where a thing stands, in the coordinates of the scene."""
 
-    place: Doubles  # (2,) of its middle
+    place: parts.Doubles  # (2,) of its middle
     height: float  # of the ground there
     pushed: float  # how far it was moved away from the object
 
@@ -52,12 +56,12 @@ class ThingsControl(Control):
 
     kind = "things"
     parameters = (
-        moving(ORBIT, "x", "metres", -1000.0, 1000.0, 0.0, "Forwards from where it was put.", (-2.0, 2.0)),
-        moving(ORBIT, "y", "metres", -1000.0, 1000.0, 0.0, "To the left of where it was put.", (-2.0, 2.0)),
-        moving(ORBIT, "heading", "degrees", -3600.0, 3600.0, 0.0, "Turn from how it was put, counter-clockwise.",
-               (-180.0, 180.0), periodic=True),
-        named("presence", ("there", "away"), "there", "Whether it is there.", estimators=("differences",),
-              moves_silhouettes=True),
+        _moving("x", "metres", -1000.0, 1000.0, 0.0, "Forwards from where it was put.", (-2.0, 2.0)),
+        _moving("y", "metres", -1000.0, 1000.0, 0.0, "To the left of where it was put.", (-2.0, 2.0)),
+        _moving("heading", "degrees", -3600.0, 3600.0, 0.0, "Turn from how it was put, counter-clockwise.",
+                (-180.0, 180.0), periodic=True),
+        Parameter.named("presence", ("there", "away"), "there", "Whether it is there.", estimators=("differences",),
+                        moves_silhouettes=True),
     )  # fmt: skip
 
     @classmethod
@@ -86,10 +90,10 @@ class ThingsControl(Control):
             if stand.pushed:
                 raise InputError(f"`controls` {self.name}: {name} stands in something else; put it elsewhere")
 
-    def laid_out(self) -> Iterator[Slot]:
+    def laid_out(self) -> Iterator[tuple[Parameter, Fixed | Range | OneOf]]:
         for thing, parameter in product(self.scene.things, map(self.in_scene, self.parameters)):
             asked = f"{thing}.{parameter.name}"
-            yield Slot(replace(parameter, name=asked), self.specs.get(asked, self.spec(parameter)))
+            yield replace(parameter, name=asked), self.specs.get(asked, self.spec(parameter))
 
     def in_scene(self, parameter: Parameter) -> Parameter:
         reach = min(2.0, self.scene.metres)  # beside a small thing, two metres are off its table
@@ -99,8 +103,8 @@ class ThingsControl(Control):
     def refines(self) -> frozenset[str]:
         """None is changed; but it comes after whatever moves what things may not stand in."""
         stay = [name for name in self.scene.things if name not in self._moved]
-        poses = [f"{name}.to_world" for name in (OBJECT, "camera", *stay)]
-        return frozenset([*poses, *(f"{name}.offsets" for name in (OBJECT, *self.scene.things))])
+        poses = [f"{name}.to_world" for name in ("object", "camera", *stay)]
+        return frozenset([*poses, *(f"{name}.offsets" for name in ("object", *self.scene.things))])
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         inputs = {}
@@ -108,31 +112,33 @@ class ThingsControl(Control):
             part = self.scene.meshes[name]
             base = torch.from_numpy(part.to_world).to(values[f"{name}.x"])
             foot = torch.from_numpy(_foot(part)).to(base)
-            turn = euler(values[f"{name}.heading"], *base.new_zeros(2))
+            turn = geometry.euler(values[f"{name}.heading"], *base.new_zeros(2))
             if values[f"{name}.presence"]:
                 turn = AWAY * turn
             place = base.new_tensor([*stand.place, stand.height])
             sunk = base.new_tensor([0.0, 0.0, SUNK / self.scene.metres]) * values[f"{name}.presence"]
-            inputs[f"{name}.to_world"] = affine(turn, place - sunk - turn @ foot) @ base
+            inputs[f"{name}.to_world"] = geometry.affine(turn, place - sunk - turn @ foot) @ base
         return inputs
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         """Where each thing stands in the end, as `with` says places."""
         return {
-            f"{name}.at_{axis}": measure(coordinate, "metres")
+            f"{name}.at_{axis}": Value(value=float(coordinate), unit="metres")
             for name, stand in self._stands(values, so_far).items()
-            for axis, coordinate in zip("xy", (stand.place - middle(self.scene)[:2]) * self.scene.metres, strict=True)
+            for axis, coordinate in zip(
+                "xy", (stand.place - geometry.middle(self.scene)[:2]) * self.scene.metres, strict=True
+            )
         }
 
     def _stands(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Stand]:
         """Where the things that move stand, by name; without derivatives."""
         scene, metres = self.scene, self.scene.metres
-        thing = _footprint(scene, OBJECT, so_far)
-        eye = camera_in(scene, so_far)[:3, 3].detach().double().cpu().numpy()
+        thing = _footprint(scene, "object", so_far)
+        eye = geometry.camera_in(scene, so_far)[:3, 3].detach().double().cpu().numpy()
         middle_of = (thing.outline.min(axis=0) + thing.outline.max(axis=0)) / 2.0
         free = min(CAMERA / metres, NEAR * float(np.linalg.norm(eye[:2] - middle_of)))
         around = eye[:2] + free * np.stack([np.cos(EIGHTHS), np.sin(EIGHTHS)], axis=1)
-        others = [thing, Footprint(around, eye[2], eye[2] + free)]
+        others = [thing, parts.Footprint(around, eye[2], eye[2] + free)]
         others += [_footprint(scene, name, so_far) for name in scene.things if name not in self._moved]
         solids = [solid for part in scene.around.values() for solid in part.solids]
         stands = {}
@@ -143,33 +149,33 @@ class ThingsControl(Control):
             turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
             asked = foot[:2] + np.array([x, y]) / metres
             outline = (base.outline - foot[:2]) @ turn.T
-            lift = foot[2] - ground_height(scene, foot[:2])
-            here = Footprint(outline + asked, base.low, base.high)
+            lift = foot[2] - scene.ground_height(foot[:2])
+            here = parts.Footprint(outline + asked, base.low, base.high)
             way = asked - middle_of
             way = way / np.linalg.norm(way) if way.any() else np.array([1.0, 0.0])
             pushed = 0.0
-            in_solids = [] if away else [blocked(here, solid, way) for solid in solids]
+            in_solids = [] if away else [geometry.blocked(here, solid, way) for solid in solids]
             if any(begin < 0.0 < end for begin, end in in_solids):
                 pushed = min(begin for begin, end in in_solids if begin < 0.0 < end) - GAP / metres
-            in_others = [] if away else [blocked(here, other, way) for other in others]
+            in_others = [] if away else [geometry.blocked(here, other, way) for other in others]
             for begin, end in sorted(in_others + in_solids):
                 if begin < pushed < end:
                     pushed = end + GAP / metres
             place = asked + pushed * way
-            stands[name] = Stand(place, lift + ground_height(scene, place), pushed)
+            stands[name] = Stand(place, lift + scene.ground_height(place), pushed)
             if not away:
-                others.append(Footprint(outline + place, base.low, base.high))
+                others.append(parts.Footprint(outline + place, base.low, base.high))
         return stands
 
 
-def _foot(part: MeshPart) -> Doubles:
+def _foot(part: parts.MeshPart) -> parts.Doubles:
     """Where a thing is put and turned about, (3,): the middle of its box, at the height of its lowest point."""
     low, high = part.mesh.vertices.min(axis=0), part.mesh.vertices.max(axis=0)
     foot = np.array([*(low[:2] + high[:2]) / 2.0, low[2]], np.float64)
     return np.asarray(part.to_world[:3, :3] @ foot + part.to_world[:3, 3])
 
 
-def _footprint(scene: SceneDescription, name: str, so_far: Mapping[str, Tensor]) -> Footprint:
+def _footprint(scene: SceneDescription, name: str, so_far: Mapping[str, Tensor]) -> parts.Footprint:
     """What a mesh takes up where the controls before have it."""
     part = scene.meshes[name]
     pose, offsets = (so_far.get(f"{name}.{one}") for one in ("to_world", "offsets"))
@@ -177,9 +183,9 @@ def _footprint(scene: SceneDescription, name: str, so_far: Mapping[str, Tensor])
         return _as_put(part)
     vertices = part.mesh.vertices + (0.0 if offsets is None else offsets.detach().cpu().double().numpy())
     matrix = part.to_world if pose is None else pose.detach().cpu().double().numpy()
-    return footprint(vertices @ matrix[:3, :3].T + matrix[:3, 3])
+    return geometry.footprint(vertices @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 @lru_cache(maxsize=256)
-def _as_put(part: MeshPart) -> Footprint:
-    return footprint(standing(part))
+def _as_put(part: parts.MeshPart) -> parts.Footprint:
+    return geometry.footprint(geometry.standing(part))

@@ -27,8 +27,7 @@ from advsearch.cluster import Call, Workers, WorkerStats
 from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import LOST, judged, judgement_of, trial_row
 from advsearch.errors import ClusterError, InputError
-from advsearch.models import Model
-from advsearch.models.address import AskedModel
+from advsearch.models import Model, RemoteNetwork
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Told
 from advsearch.scene.color import levels_of
@@ -127,7 +126,7 @@ def check_made_of(
     facts: dict[str, str | None] = {}
     for model in models:
         for network in model.module.models if isinstance(model.module, Ensemble) else (model,):
-            if isinstance(network.module, AskedModel):
+            if isinstance(network.module, RemoteNetwork):
                 network.module.keep_in(run.store)
             facts[f"model {network.name}"] = weights_digest(network)
     facts |= {name: code_digest(function) for name, function in (functions or {}).items() if function is not None}

@@ -15,14 +15,13 @@ from torch import nn
 from advsearch import threads
 from advsearch.config import SceneConfig
 from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
-from advsearch.controls.ranges import is_number
 from advsearch.engine.loading import CONTROL, MODEL, Controls, Scene, as_controls, controls_by_name, lent, load_scene
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.loading import named_code
 from advsearch.scene.rig import read_rig
-from advsearch.scene.settings import Given
+from advsearch.scene.settings import Given, Parameter
 from advsearch.settings import split_names
 from advsearch.tasks import Task
 from advsearch.tasks.together import Together, together
@@ -231,7 +230,7 @@ def _counting(kind: type[Control], given: Mapping[str, object]) -> list[Choice]:
     fixed = {choice.fixes for choice in kind.choices if given.get(choice.name) is not None}
     searched = {parameter.name for parameter in kind.parameters if parameter.search is not None}
     searched |= {name for name, value in given.items() if value is not None}
-    searched -= fixed | {name for name, value in given.items() if is_number(value)}
+    searched -= fixed | {name for name, value in given.items() if Parameter.is_number(value)}
     return [choice for choice in kind.choices if not choice.bounds or choice.bounds in searched]
 
 

@@ -35,15 +35,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.errors import CodeNotAllowedError, InputError, ModelError, UnknownNameError
-from advsearch.interrupts import INTERRUPTS
-from advsearch.models.model import Model, Preprocessing
-from advsearch.models.source import Purpose
-from advsearch.models.zoo.language import QUESTION, SIDE
-from advsearch.pictures import png_of
-from advsearch.trust.code import how_to_allow, may_fetch
-from advsearch.trust.network import KEY, NoRedirect, check_address, is_local, read_key
-from advsearch.trust.stored_files import parse_json, scaled
+from advsearch.extend import InputError, Model, ModelError, UnknownNameError, models, stored_files
 
 CHAT = "/chat/completions"  # how the path of an address ends that is asked as OpenAI's chat is
 
@@ -78,14 +70,14 @@ class KeepsAnswers(Protocol):
         """Keep JSON text under a key."""
 
 
-def load(spec: str, purpose: Purpose) -> Model:
+def load(spec: str, purpose: models.Purpose) -> Model:
     """Return the model behind an address, which is asked for its names where nobody says them. Raises InputError: only
     a file names it, or as `check_address`; ModelError: it cannot do what it is to be asked, or nobody answers."""
-    address = check_address(spec)
-    if not may_fetch(spec):
-        raise CodeNotAllowedError(
-            f"a file names the model {spec}, to which pictures would be sent, and the key in {KEY}; "
-            f"{how_to_allow(spec)}"
+    address = models.check_address(spec)
+    if not models.may_fetch(spec):
+        raise models.CodeNotAllowedError(
+            f"a file names the model {spec}, to which pictures would be sent, and the key in {models.KEY}; "
+            f"{models.how_to_allow(spec)}"
         )
     chat, name = address.path.endswith(CHAT), address.fragment or address.netloc
     free, question = purpose.in_words(name, "is behind an address")
@@ -99,19 +91,19 @@ def load(spec: str, purpose: Purpose) -> Model:
         spec=spec,
         limits=limits_of(purpose.ask),
         chat=address.fragment if chat else "",
-        question=question or (QUESTION if free else ""),
+        question=question or (models.QUESTION if free else ""),
         tokens=purpose.tokens,
         times=purpose.times if free else 1,
     )
     if not free:
-        asked.names = purpose.names or tuple(asked.scores([np.full((SIDE, SIDE, 3), 128, np.uint8)])[0])
+        asked.names = purpose.names or tuple(asked.scores([np.full((models.SIDE, models.SIDE, 3), 128, np.uint8)])[0])
         if len(asked.names) < 2:
             raise ModelError(f"model {name}: expected scores of two names at least, got {len(asked.names)}")
     return Model(
         module=asked,
         name=name,
         labels=asked.names,
-        preprocessing=Preprocessing((SIDE, SIDE), resizes=False),
+        preprocessing=models.Preprocessing((models.SIDE, models.SIDE), resizes=False),
         batch_limits=(1, 8),
         differentiable=False,
     )
@@ -192,7 +184,7 @@ class _SecureHandler(_NotesConnections, urllib.request.HTTPSHandler):
 
 
 @dataclass(eq=False)
-class AskedModel:
+class AskedModel(models.RemoteNetwork):
     """Answers pictures (N, 3, H, W) in [0, 1], rounded to 8 bits: logits (N, names), or without names what is said of
     each picture (`advsearch.tasks.answers.Texts`). The same picture is not sent twice in a run, also if it goes on."""
 
@@ -262,7 +254,7 @@ class AskedModel:
         return [answers[key] for key in keys]
 
     def _body(self, image: Levels) -> dict[str, Any]:
-        picture = base64.b64encode(png_of(image)).decode()
+        picture = base64.b64encode(models.png_of(image)).decode()
         if not self.chat:
             return {"image": picture, **({"prompt": self.question} if self.question else {})}
         content = [
@@ -329,7 +321,7 @@ class AskedModel:
         waits = self.limits["tokens"] < LIMITS["tokens"] or by_token  # only an answer tells whether another is allowed
         at_once = 1 if waits else int(self.limits["at_once"])
         while left:
-            INTERRUPTS.look()
+            models.INTERRUPTS.look()
             wave = [left.pop(0) for _ in range(self._reserve(min(at_once, len(left))))]
             sent = self._together([json.dumps(bodies[place]).encode() for place, _, _ in wave])
             failed, again = list[str](), list[tuple[int, int, float]]()
@@ -414,7 +406,9 @@ class AskedModel:
                     f"sends on to {there}, and pictures and keys are not sent there; give that address if you trust it"
                 )
             elif code in (401, 403):
-                why = f"status {code}: the key in {KEY} {'is not accepted' if read_key() else 'is missing'}"
+                why = (
+                    f"status {code}: the key in {models.KEY} {'is not accepted' if models.read_key() else 'is missing'}"
+                )
             else:
                 text = error.read(LONGEST_FAILURE).decode(errors="replace")
                 why = f"status {code} {self._clean(str(error.reason))}: {self._clean(text)[:300]}"
@@ -422,24 +416,24 @@ class AskedModel:
         return why, code in BUSY, float(asked_to) if asked_to.isdigit() else 0.0
 
     def _sent(self, body: bytes, end: float, connections: list[_Connection]) -> dict[str, Any]:
-        key = read_key()
+        key = models.read_key()
         headers = {"Content-Type": "application/json", "User-Agent": "advsearch"}
         request = urllib.request.Request(self.url, body, headers)
         if key:
             request.add_unredirected_header("Authorization", f"Bearer {key}")
-        handlers: list[Any] = [NoRedirect, _Handler(end, connections), _SecureHandler(end, connections)]
-        if is_local(request.host.rpartition(":")[0].strip("[]") or request.host):
+        handlers: list[Any] = [models.NoRedirect, _Handler(end, connections), _SecureHandler(end, connections)]
+        if models.is_local(request.host.rpartition(":")[0].strip("[]") or request.host):
             handlers.append(urllib.request.ProxyHandler({}))
         parts, size = list[bytes](), 0
         with urllib.request.build_opener(*handlers).open(request, timeout=self.limits["seconds"]) as response:
             while part := response.read1(1 << 16):
                 parts.append(part)
                 size += len(part)
-                if size > scaled(LARGEST):
-                    raise self._wrong(f"an answer of at most {scaled(LARGEST):,} bytes", "a longer one")
+                if size > stored_files.scaled(LARGEST):
+                    raise self._wrong(f"an answer of at most {stored_files.scaled(LARGEST):,} bytes", "a longer one")
         text = b"".join(parts)
         try:
-            answer = parse_json(text.decode(), finite=True)
+            answer = stored_files.parse_json(text.decode(), finite=True)
         except ValueError as error:  # UnicodeDecodeError is one
             raise self._wrong("JSON", f"{self._clean(text[:60].decode(errors='replace'))!r} ({error})") from None
         if not isinstance(answer, dict):
@@ -448,7 +442,7 @@ class AskedModel:
 
     def _clean(self, text: str) -> str:
         """What a server says, in one line and without the key, which it may send back."""
-        text = text.replace(read_key(), "(key)") if read_key() else text
+        text = text.replace(models.read_key(), "(key)") if models.read_key() else text
         return " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
 
     def _wrong(self, expected: str, got: str | Mapping[str, Any]) -> ModelError:

@@ -7,7 +7,7 @@ For any other network it is the logits less their mean. Maps and sequences are a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, final
@@ -139,3 +139,19 @@ def _of_graph(network: Any, x: Tensor, only: fx.Node | None) -> list[_Call]:
     if isinstance(network, fx.GraphModule):
         Reader(network).run(x)
     return calls
+
+
+PARTS = ("image_embeds", "pooler_output", "last_hidden_state")  # of outputs that hold the features, the best first
+
+
+def pooled(returned: Any, *, token: bool) -> Tensor | None:
+    """Return the features (N, D) in an output of a network, a tensor (N, D) or what has one of `PARTS`; None where
+    there are none. Maps (N, D, H, W) are averaged over their positions. Of several tokens (N, T, D), the first stands
+    for the picture if `token`, otherwise their mean."""
+    for part in PARTS:
+        value = returned.get(part) if isinstance(returned, Mapping) else getattr(returned, part, None)
+        if isinstance(value, Tensor):
+            if value.dim() == 3:
+                return value[:, 0] if token else value.mean(dim=1)
+            return value.flatten(2).mean(dim=2) if value.dim() == 4 else value
+    return returned if isinstance(returned, Tensor) else None

@@ -24,8 +24,7 @@ from advsearch.errors import FileFormatError, ModelError
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.inputs import SIZE_INPUTS, SIZE_TYPES, EightBitInput
 from advsearch.models.labels import names_in
-from advsearch.models.source import Source, source_of
-from advsearch.models.zoo.library import library
+from advsearch.models.source import Source, library, source_of
 from advsearch.trust import exported_programs
 from advsearch.trust.archives import LARGEST, Archive, open_archive, refused, rewritten_torchscript, without_unpickling
 from advsearch.trust.foreign_code import foreign, try_torchscript

@@ -15,13 +15,13 @@ from torch import Tensor, nn
 
 from advsearch.catalog import list_built_ins
 from advsearch.errors import InputError, ModelError, UnknownNameError, resembling
-from advsearch.models import address, files, reference
+from advsearch.models import files, reference
 from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
 from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
-from advsearch.models.model import PRESETS, Model, Preprocessing, Read
+from advsearch.models.model import PRESETS, Model, Preprocessing, Read, RemoteNetwork
 from advsearch.models.probe import probe
 from advsearch.models.source import Purpose, Source, load_callable, source_of, split_weights
-from advsearch.registry import Registry
+from advsearch.registry import Registry, imported
 from advsearch.trust.foreign_code import called_under, plainly, turned_by_code
 
 DEFAULT_INPUT_SIZE = (224, 224)  # where neither the model nor the caller says
@@ -106,7 +106,7 @@ def load_model(
     wanted, lengths = task.name if task else "classification", (getattr(task, "tokens", 16), getattr(task, "times", 1))
     source = _find(spec, Purpose(wanted, names, prompts, *lengths, ask or {}))
     switches = turned_by_code()
-    reads_text = source.reads_text if isinstance(source, Source) else isinstance(source.module, address.AskedModel)
+    reads_text = source.reads_text if isinstance(source, Source) else isinstance(source.module, RemoteNetwork)
     if prompts is not None and (source is spec or not reads_text):
         raise InputError(f"prompt: model {source.name} has classes of its own and reads no text; leave `prompt` out")
     if isinstance(source, Source) and isinstance(source.module, nn.Module):
@@ -201,16 +201,13 @@ def _find(spec: object, purpose: Purpose) -> Source | Model:
 
 def _find_library_source(network: nn.Module, purpose: Purpose) -> Source | None:
     """Return the source of a network of transformers or timm; None of any other."""
-    source = None
-    if "transformers" in sys.modules and "hf" in SOURCES.own:
-        from advsearch.models.zoo import transformers  # late: most models are no network of it
-
-        source = transformers.of_network(network, purpose)
-    if source is None and "timm" in sys.modules and "timm" in SOURCES.own:
-        from advsearch.models.zoo import outputs  # likewise
-
-        source = outputs.of_timm(network, purpose)
-    return source
+    for library, recognizer in list_built_ins("recognizer").items():
+        if library in sys.modules:
+            recognize: Callable[[nn.Module, Purpose], Source | None] = imported(recognizer.target)
+            source = recognize(network, purpose)
+            if source is not None:
+                return source
+    return None
 
 
 def _preprocessing(source: Source, given: Mapping[str, object]) -> Preprocessing:

@@ -92,6 +92,23 @@ GIVEN_BY = {
 """What networks of a task return, by task, for messages."""
 
 
+class RemoteNetwork:
+    """A network elsewhere that only answers. A run keeps its answers, and states what they cost."""
+
+    def __call__(self, pictures: Tensor) -> Any:
+        """Return what the network says of pictures (N, 3, H, W) in [0, 1]."""
+        raise NotImplementedError
+
+    @property
+    def sentence(self) -> str:
+        """What a run has spent, for its reader."""
+        raise NotImplementedError
+
+    def keep_in(self, store: Any) -> None:
+        """Keep answers and what is spent in a run from here on: an `advsearch.runs.store.Store`."""
+        raise NotImplementedError
+
+
 class ModelWarning(UserWarning):
     """A model that works, but not as an attack would like it to (probabilities, randomness, no gradient)."""
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import difflib
 import importlib
+import importlib.util
 import os
 import pickle
 import traceback
@@ -31,6 +32,10 @@ from advsearch.trust.archives import LARGEST
 from advsearch.trust.code import check_import, current_directory_importable
 from advsearch.trust.foreign_code import first_line
 from advsearch.trust.stored_files import open_regular
+
+QUESTION = "What is this? Answer with its name only."  # what is asked where nothing else is said
+SIDE = 448
+"""Side in pixels of pictures for networks that take any size: a multiple of 28 and of 32, the cells of Qwen's."""
 
 
 @dataclass(frozen=True)
@@ -239,3 +244,19 @@ def near_names(name: str, known: Iterable[str]) -> list[str]:
     """Return at most a dozen names to show, the nearest first."""
     names = sorted(known)
     return difflib.get_close_matches(name, names, n=12, cutoff=0.3) or names[:12]
+
+
+def library(name: str, spec: str, extra: str) -> Any:
+    """Return an optional library, that an extra of advsearch installs and a model needs. Raises ModelError where it is
+    not installed, or cannot be imported."""
+    try:
+        return importlib.import_module(name)
+    except Exception as error:  # a build for another torch raises RuntimeError, among others
+        command = f"pip install 'advsearch[{extra}]'"
+        if isinstance(error, ModuleNotFoundError) and error.name == name:
+            raise ModelError(f"model {spec}: needs {name}, which is not installed: {command}") from error
+        raise ModelError(
+            f"model {spec}: needs {name}, which cannot be imported here ({first_line(error)}). Install builds that fit "
+            f"each other: {command}, torch's own index where that has them; or export the network with torch.export "
+            f"where {name} works, and give the .pt2 file"
+        ) from error

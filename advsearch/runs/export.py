@@ -9,17 +9,17 @@ import io
 import itertools
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any, TypeGuard
 
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.files import JsonObject, JsonValue
-from advsearch.options import NOT_A_NUMBER, Value
+from advsearch.options import Value
 from advsearch.runs.store import Row, Store
 from advsearch.trust.stored_files import open_regular, parse_json, read_text
-from advsearch.trust.writing import check_free_folder, placed_by, replacing, write_bytes, write_text
+from advsearch.trust.writing import placed_by, replacing
 
 FORMATS = ("csv", "json", "parquet")
 PAYLOAD = "payload"
@@ -129,53 +129,6 @@ DETAILS, CLASSES, IMAGES = "details.log", "class_maps.json", "images"
 LARGEST = 4 << 30
 LONGEST = 1 << 20  # most bytes of one of its lines
 MOST_CLASSES = 16 << 20  # most bytes of a `class_maps.json`
-_PLACED = ("environment", "object")  # values that have a place of their own in a line
-
-
-def write_threedb(rows: Callable[[], Iterable[Row]], out: Path, picture: Callable[[int], bytes | None]) -> int:
-    """Write the rows of a sweep as such a folder, made or empty, with the PNG of each, where one was kept, and return
-    how many there were. ``loss`` is the margin with its sign turned: over 0 where a prediction is not right. The
-    parameter ``network`` tells what several networks predict apart."""
-    check_free_folder(out, "out")
-    names, classes = dict[str, None](), dict[str, int | None]()
-    for row in rows():
-        names |= dict.fromkeys(name for name in row.values if name not in _PLACED)
-        classes.setdefault(row.label or NOT_A_NUMBER, row.label_index)
-    if not classes:
-        raise InputError("format 3db: needs the rows of a sweep, and this run has none")
-    numbers = {name: number for name, number in classes.items() if number is not None}
-    for name in [one for one in classes if one not in numbers]:  # behind the others
-        numbers[name] = max(numbers.values(), default=-1) + 1
-    called = {number: name for name, number in numbers.items()}
-    with placed_by("out"):
-        count = 0
-        with replacing(out / DETAILS) as part, part.open("w", encoding="utf-8") as file:
-            for row in rows():
-                line = _line(row, names, numbers[row.label or NOT_A_NUMBER])
-                file.write(json.dumps(line, allow_nan=False) + "\n")
-                data = picture(row.step)
-                if data is not None:
-                    write_bytes(out / IMAGES / f"{line['id']}_rgb.png", data, durable=False)
-                count += 1
-        listed = [called.get(number, f"class {number}") for number in range(max(called) + 1)]
-        write_text(out / CLASSES, json.dumps(listed))
-    return count
-
-
-def _line(row: Row, names: Iterable[str], prediction: int) -> JsonObject:
-    said = {name: one["value"] for name, one in row.values.items()}
-    parameters = {"network" if name == "model" else name: said.get(name, "none") for name in names}
-    environment, model = (str(said.get(name, "none")) for name in _PLACED)
-    return {
-        "id": f"{row.step}",
-        "environment": environment,
-        "model": model,
-        "is_correct": str(bool(row.correct)),
-        "loss": None if row.margin is None else 0.0 - row.margin,
-        "prediction": [prediction],
-        "output_type": "classes",
-        "render_args": parameters,  # type: ignore[dict-item]
-    }
 
 
 def read_threedb(folder: Path) -> Iterator[tuple[Row, Path | None]]:

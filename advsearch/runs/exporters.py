@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 from advsearch.catalog import list_built_ins
+from advsearch.progress import Progress
 from advsearch.registry import Registry
+from advsearch.runs.files import write_png
 
 
 class Exported(NamedTuple):
@@ -42,15 +44,17 @@ class Exporter(ABC):
     example: ClassVar[str]
     suffix: ClassVar[str] = ""
     options: ClassVar[tuple[str, ...]] = ()
+    write_png = staticmethod(write_png)
 
     @abstractmethod
-    def write(self, run: str, out: Path, options: Mapping[str, Any]) -> Exported:
-        """Write a run.
+    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+        """Write a run. What libraries print meanwhile does not reach standard output.
 
         Args:
             run: the run's name or directory, see `advsearch.runs.directory.find_run`.
             out: the file or directory to write.
             options: the values of `options`; None where one was not given.
+            progress: is told of long work.
 
         Raises:
             AdvsearchError: the run cannot be exported, or `out` cannot be written.

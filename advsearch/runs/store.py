@@ -11,14 +11,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import TracebackType
-from typing import Any, final, get_args, get_type_hints
+from typing import Any, ClassVar, final, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
-from advsearch.options import OUT_OF_VIEW, Value
+from advsearch.options import NOT_A_NUMBER, OUT_OF_VIEW, Value
 from advsearch.runs.files import SCHEMA, check_version, connect_to_write
 from advsearch.runs.results import plain
 from advsearch.trust.databases import DAMAGED, check_schema, connect_to_read, readable
@@ -97,6 +97,9 @@ _INSERT_TOLD = "INSERT INTO told SELECT id, ?, ?, ?, ?, ?, ?, ? FROM evaluations
 class Store:
     """The open `results.sqlite` of a run; `read_only` beside a process that writes. Close it, or use it in a `with`
     block."""
+
+    FILE: ClassVar[str] = NAME  # in the directory of a run
+    NOT_A_NUMBER: ClassVar[str] = NOT_A_NUMBER  # the prediction of a row without a label
 
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+
+from advsearch.scene.settings import CHANNELS as CHANNELS
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -41,3 +44,10 @@ def levels_of(display: Tensor) -> Tensor:
 def to_8_bit(display: Tensor) -> Tensor:
     """Round to the 256 levels of an 8-bit file and return the values in [0, 1]; not differentiable."""
     return (display.detach() * 255.0).round() / 255.0
+
+
+def combine_channels(values: Mapping[str, Tensor]) -> Tensor:
+    """Return the linear color (3,) of the display-referred numbers red, green and blue; differentiable."""
+    import torch  # whoever has tensors has it already
+
+    return srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))

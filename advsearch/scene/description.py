@@ -22,7 +22,7 @@ from advsearch.scene.assets import TRIPOD, Doubles, EnvironmentAsset, Material, 
 from advsearch.scene.camera_entries import ON_TABLES, PRESETS, TABLE, TABLE_SIDE
 from advsearch.scene.camera_files import read_camera
 from advsearch.scene.camera_model import CameraModel, bundled
-from advsearch.scene.formation import metered_gain
+from advsearch.scene.formation import METERED_WHITE, WHITE, arriving, metered_gain
 from advsearch.scene.grounds import (
     Photograph,
     has_lanes,
@@ -50,7 +50,7 @@ from advsearch.scene.parts import (
 from advsearch.scene.places.quads import FLOOR
 from advsearch.scene.rig import Mount, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
-from advsearch.scene.things import ThingPart, with_solids_checked, with_things
+from advsearch.scene.things import ThingPart, ground_height, with_solids_checked, with_things
 from advsearch.trust.stored_files import reading
 
 DEFAULT_ENVIRONMENT = "studio"
@@ -107,6 +107,15 @@ class SceneDescription:
     def with_values(self, **given: float | None) -> SceneDescription:
         """Return the scene with some settings replaced; dots in their names are written as two underscores."""
         return replace(self, values={**self.values, **{name.replace("__", "."): v for name, v in given.items()}})
+
+    def without_ground(self) -> SceneDescription:
+        """Return the scene without a table, a road or a place."""
+        return on_its_ground(self.with_values(ground__size=0.0))
+
+    @staticmethod
+    def load_object(spec: str | Path) -> ObjectAsset:
+        """Return a bundled object or one from a mesh file. Raises InputError: there is none, or it can't be used."""
+        return _object(spec, None, None)
 
     def seen_by(self, camera: str) -> SceneDescription:
         """Return the scene as one of its cameras sees it, or as the camera around the object does with another lens: by
@@ -260,8 +269,7 @@ class SceneDescription:
 
     @property
     def _meets_traffic(self) -> bool:
-        orbits = self.camera == ORBIT_CAMERA
-        return orbits and is_against_traffic(self, geometry.camera_to_world(self))
+        return self.is_seen_from_orbit and is_against_traffic(self, geometry.camera_to_world(self))
 
     def environment_for(self, who: str) -> EnvironmentAsset:
         """Return the environment for what cannot do without a map. Raises InputError: the scene has none."""
@@ -269,6 +277,24 @@ class SceneDescription:
             check_one_environment(self.parts, who)
             raise InputError(f"{who}: the scene has no environment map; give it one, or leave {who} out")
         return self.environment
+
+    @property
+    def is_seen_from_orbit(self) -> bool:
+        """Whether the settings `camera.*` say where its camera is, and not a file."""
+        return self.camera == ORBIT_CAMERA
+
+    @property
+    def metered_irradiance(self) -> float:
+        """Irradiance for which the exposure of its images is metered, in scene units."""
+        return METERED_WHITE * math.pi / (WHITE * metered_gain(self))
+
+    def list_environment_light(self) -> tuple[Doubles, Doubles, Doubles]:
+        """Return unit directions (N, 3) to the environment's light, solid angles (N,), and radiance times these."""
+        return arriving(self)
+
+    def ground_height(self, place: Doubles) -> float:
+        """Return how high the ground lies at a place (2,), object sizes: road, pavement, table or floor; or 0."""
+        return ground_height(self, place)
 
     @property
     def base_vertices(self) -> Doubles:

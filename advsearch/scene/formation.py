@@ -21,12 +21,11 @@ from torch import Tensor
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Ints, face_vectors
 from advsearch.scene.color import LOW_END, linear_to_srgb, srgb_to_linear
-from advsearch.scene.geometry import NEAREST, camera_to_world, object_to_world, rotation, standing
+from advsearch.scene.geometry import NEAREST, Frame, camera_to_world, object_to_world, rotation, standing
 from advsearch.scene.grounds import paved
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import looked_up, pixels_in
 from advsearch.scene.settings import ORBIT_CAMERA, resolve
-from advsearch.scene.silhouettes import Frame
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription

@@ -17,17 +17,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from advsearch.scene.assets import Doubles, pose_of
-from advsearch.scene.parts import MeshPart
+from advsearch.scene.camera_model import CameraModel as CameraModel
+from advsearch.scene.parts import Footprint, MeshPart
 from advsearch.scene.settings import ORBIT_CAMERA, POSE, SETTINGS
+from advsearch.scene.skeleton import entries_of_turn as entries_of_turn
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -37,6 +40,32 @@ CLEARANCE = 0.02  # smallest distance, in object sizes, to the sphere around the
 STEEPEST = math.sin(math.radians(89.0))  # sine of the largest elevation, for a height that would need a steeper one
 NEAREST = 1e-3  # depth up to which points have no place in the picture
 DEFAULT_VIEW = ("camera.azimuth", "camera.elevation", "camera.roll")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What the picture shows, as tangents: the ranges to the right and upwards."""
+
+    left: float
+    right: float
+    low: float
+    high: float
+
+    @staticmethod
+    def of(fov: float, aspect: float = 1.0, shift: tuple[float, float] = (0.0, 0.0)) -> Frame:
+        """Return the frame of a camera with a field of view along the larger side, degrees, an aspect of width over
+        height, and a shift of the picture to the right in its widths and downwards in its heights: what it shows moves
+        the other way."""
+        larger = math.tan(math.radians(fov) / 2.0)
+        x, y = larger * min(1.0, aspect), larger * min(1.0, 1.0 / aspect)
+        right, down = 2.0 * x * shift[0], 2.0 * y * shift[1]
+        return Frame(-x + right, x + right, -y - down, y - down)
+
+    def corners(self) -> Doubles:
+        """Unit directions (4, 3) to the corners."""
+        tangents = [(x, y, 1.0) for x in (self.left, self.right) for y in (self.low, self.high)]
+        corners = np.array(tangents)
+        return np.asarray(corners / np.linalg.norm(corners, axis=-1, keepdims=True))
 
 
 def framing_distance(description: SceneDescription, fov: Tensor, aspect: float) -> Tensor:
@@ -209,3 +238,76 @@ def real_harmonics(height: int, width: int) -> Tensor:
     first = [torch.ones_like(z), root3 * y, root3 * z, root3 * x]
     second = [root15 * x * y, root15 * y * z, root5 / 2.0 * (3.0 * z * z - 1.0), root15 * x * z]
     return torch.stack([*first, *second, root15 / 2.0 * (x * x - y * y)], dim=-1)
+
+
+def euler(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
+    """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix; differentiable."""
+    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    (cz, sz), (cy, sy), (cx, sx) = ((torch.cos(a), torch.sin(a)) for a in map(torch.deg2rad, (yaw, pitch, roll)))
+    about_z = torch.stack([cz, -sz, zero, sz, cz, zero, zero, zero, one]).reshape(3, 3)
+    about_y = torch.stack([cy, zero, sy, zero, one, zero, -sy, zero, cy]).reshape(3, 3)
+    about_x = torch.stack([one, zero, zero, zero, cx, -sx, zero, sx, cx]).reshape(3, 3)
+    return about_z @ about_y @ about_x
+
+
+def rotation_vector(degrees: Tensor) -> Tensor:
+    """Return the rotation about the axis of a vector by its length in degrees, (3,) to (3, 3).
+
+    Rodrigues' formula with guarded series, so that value and derivative are right at zero, where the plain formula is
+    NaN.
+    """
+    vector = degrees * (math.pi / 180.0)
+    square = vector.square().sum()
+    small = square < 1e-6
+    angle = torch.sqrt(torch.where(small, torch.ones_like(square), square))
+    sine = torch.where(small, 1.0 - square / 6.0, torch.sin(angle) / angle)
+    cosine = torch.where(small, 0.5 - square / 24.0, (1.0 - torch.cos(angle)) / angle.square())
+    x, y, z = vector
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    return torch.eye(3).to(degrees) + sine * cross + cosine * (cross @ cross)
+
+
+PARKED = 1e-3  # size of an occluder that is put away, behind the camera
+SURROUNDINGS = ("camera.to_world", "camera.fov", "camera.shift", "camera.lens", "object.to_world", "object.offsets")
+"""Inputs of other controls that an occluder goes by."""
+
+
+def camera_in(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> Tensor:
+    """Return the pose (4, 4) of the camera where the controls before have it."""
+    return so_far.get("camera.to_world", torch.from_numpy(camera_to_world(scene)))
+
+
+def put_away(camera: Tensor) -> Tensor:
+    """Return the pose (4, 4) of what is out of sight: tiny, behind the camera of a pose (4, 4)."""
+    return affine(PARKED * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])
+
+
+def footprint(points: Doubles) -> Footprint:
+    """Return what a cloud of points (N, 3) takes up."""
+    corners = ConvexHull(points[:, :2], qhull_options="QJ").vertices
+    return Footprint(points[corners, :2], float(points[:, 2].min()), float(points[:, 2].max()))
+
+
+def overlapping(one: Footprint, other: Footprint) -> bool:
+    """Return whether two outlines overlap, at heights that both have."""
+    begin, end = blocked(one, other, np.array([1.0, 0.0]))
+    return begin < 0.0 < end
+
+
+def blocked(one: Footprint, other: Footprint, way: Doubles) -> tuple[float, float]:
+    """Return from where to where one thing overlaps with another as it is shifted along a way (2,), in lengths of that;
+    (inf, -inf) where it never does. By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1),
+    each of which says so of a stretch."""
+    if min(one.high, other.high) <= max(one.low, other.low):
+        return math.inf, -math.inf
+    edges = np.concatenate([np.roll(points, -1, axis=0) - points for points in (one.outline, other.outline)])
+    across = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
+    first, second, speed = one.outline @ across.T, other.outline @ across.T, across @ way
+    reach = np.stack([second.min(axis=0) - first.max(axis=0), second.max(axis=0) - first.min(axis=0)])
+    still = speed == 0.0
+    if (still & ((reach[0] >= 0.0) | (reach[1] <= 0.0))).any():
+        return math.inf, -math.inf
+    stretches = np.sort(reach[:, ~still] / speed[~still], axis=0)
+    begin, end = float(stretches[0].max()), float(stretches[1].min())
+    return (begin, end) if begin < end else (math.inf, -math.inf)

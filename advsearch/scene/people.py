@@ -26,10 +26,10 @@ import torch
 from torch import Tensor
 
 from advsearch.options import Value
-from advsearch.scene.settings import GEOMETRIC, Parameter, moving
+from advsearch.scene.settings import Parameter
 
 AGES = (10.0, 25.0, 90.0)  # years of MakeHuman's child, young and old
-_of_body = partial(moving, GEOMETRIC)
+_of_body = partial(Parameter.moving, Parameter.GEOMETRIC)
 
 
 def _angle(name: str, low: float, high: float, text: str) -> Parameter:

@@ -11,7 +11,7 @@ rest (z up), first x, then y, then z, carried along by the joints above it.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -20,15 +20,15 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.options import Value
 from advsearch.scene.assets import Doubles, Ints
-from advsearch.scene.people import about
-from advsearch.scene.settings import GEOMETRIC, Parameter, moving
+from advsearch.scene.people import PARAMETERS, about
+from advsearch.scene.settings import Parameter
 from advsearch.scene.skeleton import Clip, Movable, Track, entries_of_turn, with_above
 
 AXES = ("x", "y", "z")
+PERSON = PARAMETERS  # everything that a person can be asked for
 WEIGHT = "weight"
-TIME = moving(
-    GEOMETRIC, "time", "1", 0.0, 1.0, 0.0, "Of the clip of a rigged file: 0 is its beginning, 1 its end.", (0.0, 1.0)
-)
+_moving = partial(Parameter.moving, Parameter.GEOMETRIC)
+TIME = _moving("time", "1", 0.0, 1.0, 0.0, "Of the clip of a rigged file: 0 is its beginning, 1 its end.", (0.0, 1.0))
 NEARLY_ONE = 1.0 - 1e-9  # cosine of the angle between rotations beyond which arc and chord are the same
 
 
@@ -38,8 +38,8 @@ def part_of_a_rig(name: str) -> Parameter | None:
     if not (whose and dot and what in (*AXES, WEIGHT)):
         return None
     if what == WEIGHT:
-        return moving(GEOMETRIC, name, "1", 0.0, 1.0, 0.0, f"How much of the morph target {whose} there is.")
-    return moving(GEOMETRIC, name, "degrees", -360.0, 360.0, 0.0, f"Turn of the joint {whose} about {what}.")
+        return _moving(name, "1", 0.0, 1.0, 0.0, f"How much of the morph target {whose} there is.")
+    return _moving(name, "degrees", -360.0, 360.0, 0.0, f"Turn of the joint {whose} about {what}.")
 
 
 class SkeletonRig:

@@ -8,8 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import ClassVar, TypeGuard
 
 from advsearch.errors import InputError, UnknownNameError
+
+CHANNELS = ("red", "green", "blue")
 
 
 @dataclass(frozen=True)
@@ -31,41 +34,70 @@ class Parameter:
     options: tuple[str, ...] = ()  # the names of a discrete choice, which has no derivative; empty for numbers
     estimators: tuple[str, ...] = ("differences",)  # valid ways to differentiate it, preferred first
 
+    LARGEST: ClassVar[float] = 1e30  # no quantity of a scene is larger; the square of one that is has no float32
+    GEOMETRIC: ClassVar[tuple[str, ...]] = ("secant", "differences", "material")
+    """Valid estimators for what moves a mesh."""
+    ORBIT: ClassVar[tuple[str, ...]] = ("secant", "differences")
+    """Of a camera, which is differentiated by differences: Mitsuba has no derivative of sensors."""
+    LIT: ClassVar[tuple[str, ...]] = ("adjoint", "differences")
+    """Of what changes only light and colors."""
 
-GEOMETRIC = ("secant", "differences", "material")  # valid estimators for what moves a mesh
-ORBIT = ("secant", "differences")  # Mitsuba has no derivative of sensors, so a camera is differentiated by differences
-CHANNELS = ("red", "green", "blue")
-LIT = ("adjoint", "differences")  # valid estimators for what only changes light and colours
+    @staticmethod
+    def is_number(value: object) -> TypeGuard[float]:
+        """Return whether a value is a number that float32 has: no truth value, not NaN, and at most `LARGEST`."""
+        is_real = isinstance(value, (int, float)) and not isinstance(value, bool)
+        return is_real and abs(value) <= Parameter.LARGEST  # type: ignore[arg-type]
 
+    @classmethod
+    def number(
+        cls, estimators: tuple[str, ...], name: str, unit: str, low: float, high: float, default: float | str,
+        text: str, search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
+    ) -> Parameter:  # fmt: skip
+        """Make a number that moves no outlines; see `moving` for one that does."""
+        return cls(name, (), unit, low, high, default, text, periodic, False, search, log, estimators=estimators)
 
-def moving(
-    estimators: tuple[str, ...], name: str, unit: str, low: float, high: float, default: float | str, text: str,
-    search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
-) -> Parameter:  # fmt: skip
-    return Parameter(name, (), unit, low, high, default, text, periodic, True, search, log, estimators=estimators)
+    @classmethod
+    def moving(
+        cls, estimators: tuple[str, ...], name: str, unit: str, low: float, high: float, default: float | str,
+        text: str, search: tuple[float, float] | None = None, *, periodic: bool = False, log: bool = False,
+    ) -> Parameter:  # fmt: skip
+        """Make a number that can move an outline in the image."""
+        return cls(name, (), unit, low, high, default, text, periodic, True, search, log, estimators=estimators)
 
+    @classmethod
+    def named(
+        cls, name: str, options: tuple[str, ...], default: str, text: str, *, estimators: tuple[str, ...] = (),
+        moves_silhouettes: bool = False,
+    ) -> Parameter:  # fmt: skip
+        """Make a choice among names."""
+        return cls(
+            name, (), "name", 0.0, len(options) - 1.0, default, text, False, moves_silhouettes, options=options,
+            estimators=estimators,
+        )  # fmt: skip
 
-def colors(
-    text: str,
-    search: tuple[float, float] | None = None,
-    *,
-    low: float = 0.0,
-    defaults: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    estimators: tuple[str, ...] = LIT,
-) -> tuple[Parameter, ...]:
-    """Return the three numbers of a colour, display-referred sRGB; the text goes on behind "Red", "Green", "Blue"."""
-    texts = [f"{name.capitalize()} {text}" for name in CHANNELS]
-    return tuple(
-        Parameter(name, (), "sRGB", low, 1.0, default, words, search=search, estimators=estimators)
-        for name, default, words in zip(CHANNELS, defaults, texts, strict=True)
-    )
+    @classmethod
+    def colors(
+        cls,
+        text: str,
+        search: tuple[float, float] | None = None,
+        *,
+        low: float = 0.0,
+        defaults: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        estimators: tuple[str, ...] = LIT,
+    ) -> tuple[Parameter, ...]:
+        """Make the three numbers of a color, display-referred sRGB; the text goes on behind "Red", "Green", "Blue"."""
+        texts = [f"{name.capitalize()} {text}" for name in CHANNELS]
+        return tuple(
+            cls(name, (), "sRGB", low, 1.0, default, words, search=search, estimators=estimators)
+            for name, default, words in zip(CHANNELS, defaults, texts, strict=True)
+        )
 
 
 def _surface(name: str, text: str, search: tuple[float, float]) -> Parameter:
-    return Parameter(name, (), "1", 0.0, 1.0, "the material's own", text, search=search, estimators=LIT)
+    return Parameter(name, (), "1", 0.0, 1.0, "the material's own", text, search=search, estimators=Parameter.LIT)
 
 
-_pose, _camera = partial(moving, GEOMETRIC), partial(moving, ORBIT)
+_pose, _camera = partial(Parameter.moving, Parameter.GEOMETRIC), partial(Parameter.moving, Parameter.ORBIT)
 
 POSE = (
     _pose("yaw", "degrees", -3600.0, 3600.0, 0.0, "Rotation about the vertical.", (0.0, 360.0), periodic=True),
@@ -113,9 +145,9 @@ def _lamps(whose: str) -> Parameter:
 
 ENVIRONMENT = (
     Parameter("rotation", (), "degrees", -3600.0, 3600.0, 0.0, "Rotation about the vertical.", periodic=True,
-              search=(0.0, 360.0), estimators=LIT),
+              search=(0.0, 360.0), estimators=Parameter.LIT),
     Parameter("exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0),
-              estimators=LIT),
+              estimators=Parameter.LIT),
 )  # fmt: skip
 GROUND_KINDS = (
     TABLE, PHOTOGRAPH, DRY_ROAD, WET_ROAD, DRY_AVENUE, WET_AVENUE, CROSSING, CAR_PARK, ROOM, LIT_ROOM, SNOW_AVENUE,
@@ -133,7 +165,7 @@ GROUND = (
               "or a place with all that stands in it: an avenue, a crossing, a car park or a room.",
               options=GROUND_KINDS),
     Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),
-    *colors("of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
+    *Parameter.colors("of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
     Parameter("height", (), "metres", 1e-3, 1000.0, f"1.6, or {PHOTOGRAPHED_FROM:g} object sizes",
               "Height above the floor from which the photograph was taken; in object sizes as `camera.distance`."),
     Parameter("radius", (), "metres", 1e-3, 1e5, "5 heights",

@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import LARGEST, SMALLEST, Doubles, ObjectAsset, doubts, footing, pose_of, sized
-from advsearch.scene.geometry import middle, rotation, standing
+from advsearch.scene.geometry import footprint, middle, overlapping, rotation, standing
 from advsearch.scene.grounds import has_lanes
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.parts import Footprint, MeshPart, mesh_part
@@ -177,18 +176,6 @@ def heights_over(corners: Doubles, place: Doubles) -> list[float]:
     return heights
 
 
-def footprint(points: Doubles) -> Footprint:
-    """Return what a cloud of points (N, 3) takes up."""
-    corners = ConvexHull(points[:, :2], qhull_options="QJ").vertices
-    return Footprint(points[corners, :2], float(points[:, 2].min()), float(points[:, 2].max()))
-
-
-def overlapping(one: Footprint, other: Footprint) -> bool:
-    """Return whether two outlines overlap, at heights that both have."""
-    begin, end = blocked(one, other, np.array([1.0, 0.0]))
-    return begin < 0.0 < end
-
-
 SOLID_NAMES = {
     "houses": "a house", "posts": "a lamp post", "trees": "the trunk of a tree", "sign-post": "the post of a sign",
     "walls": "a wall", "furniture": "a piece of furniture", "lamp": "the ceiling",
@@ -237,21 +224,3 @@ def camera_remarks(scene: SceneDescription, eyes: Sequence[Doubles]) -> tuple[st
         f"The camera is inside {solids} of the place in {fraction:.0f} % of the views: it sees no object from there; "
         "narrow where it goes.",
     )
-
-
-def blocked(one: Footprint, other: Footprint, way: Doubles) -> tuple[float, float]:
-    """Return from where to where one thing overlaps with another as it is shifted along a way (2,), in lengths of that;
-    (inf, -inf) where it never does. By separating axes (Ericson 2005, Real-Time Collision Detection, section 5.2.1),
-    each of which says so of a stretch."""
-    if min(one.high, other.high) <= max(one.low, other.low):
-        return math.inf, -math.inf
-    edges = np.concatenate([np.roll(points, -1, axis=0) - points for points in (one.outline, other.outline)])
-    across = np.stack([edges[:, 1], -edges[:, 0]], axis=1)[edges.any(axis=1)]
-    first, second, speed = one.outline @ across.T, other.outline @ across.T, across @ way
-    reach = np.stack([second.min(axis=0) - first.max(axis=0), second.max(axis=0) - first.min(axis=0)])
-    still = speed == 0.0
-    if (still & ((reach[0] >= 0.0) | (reach[1] <= 0.0))).any():
-        return math.inf, -math.inf
-    stretches = np.sort(reach[:, ~still] / speed[~still], axis=0)
-    begin, end = float(stretches[0].max()), float(stretches[1].min())
-    return (begin, end) if begin < end else (math.inf, -math.inf)

@@ -11,13 +11,24 @@ from torch import Tensor
 from advsearch.catalog import list_built_ins
 from advsearch.copies import copied
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.files import JsonValue
 from advsearch.models import Model
-from advsearch.options import FROM_RUN, JOINED, check_options, check_takes, told
+from advsearch.options import (
+    FROM_RUN,
+    JOINED,
+    NOT_A_NUMBER,
+    OUT_OF_VIEW,
+    OUTCOME,
+    Outcome,
+    check_options,
+    check_takes,
+    told,
+)
 from advsearch.registry import Registry, get_class
-from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Sight, Task
-from advsearch.tasks.classification import Classification
+from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Said, Sight, Task, Truth
+from advsearch.tasks.classification import NO, Classification, ClassTask, Labels, members, target_lead, wrong_lead
 from advsearch.tasks.detection import Detection
-from advsearch.tasks.together import Together
+from advsearch.tasks.together import Joined, Outputs, Together, Truths, all_said, outcome_in
 
 MOST_NUMBERS = 4  # of an output that are said one by one
 
@@ -146,6 +157,38 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
-    "TASKS", "AnyTask", "Classification", "Detection", "Facts", "Judgement", "Mark", "OwnTask", "Prediction", "Sight",
-    "Task", "function_of", "make_task", "own_task",
-]  # fmt: skip
+    "FROM_RUN",
+    "NO",
+    "NOT_A_NUMBER",
+    "OUTCOME",
+    "OUT_OF_VIEW",
+    "TASKS",
+    "AnyTask",
+    "ClassTask",
+    "Classification",
+    "Detection",
+    "Facts",
+    "Joined",
+    "JsonValue",
+    "Judgement",
+    "Labels",
+    "Mark",
+    "Outcome",
+    "Outputs",
+    "OwnTask",
+    "Prediction",
+    "Said",
+    "Sight",
+    "Task",
+    "Together",
+    "Truth",
+    "Truths",
+    "all_said",
+    "function_of",
+    "make_task",
+    "members",
+    "outcome_in",
+    "own_task",
+    "target_lead",
+    "wrong_lead",
+]

@@ -12,11 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.errors import InputError
-from advsearch.files import JsonValue
-from advsearch.models import Model
-from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Facts, Prediction, Said, Task
+from advsearch.extend import Facts, InputError, Model, Prediction, Task, tasks
 
 Words = tuple[str, ...]
 
@@ -63,7 +59,7 @@ class FreeAnswer(Task):
 
     tokens: int = 16
     times: int = 1
-    target: Words | None = field(default=None, metadata=FROM_RUN)
+    target: Words | None = field(default=None, metadata=tasks.FROM_RUN)
 
     def __post_init__(self) -> None:
         for name in ("tokens", "times"):
@@ -127,13 +123,13 @@ class FreeAnswer(Task):
         each = (Counter(_texts(one)).most_common(count) for one in output)
         return [tuple(_said(text) for text, _ in texts) for texts in each]
 
-    def said(self, output: Sequence[Utterance | Texts], truth: Words, margins: Sequence[float]) -> list[Said]:
+    def said(self, output: Sequence[Utterance | Texts], truth: Words, margins: Sequence[float]) -> list[tasks.Said]:
         """See `Task.said`: of several texts the most frequent among those that decide, and all of them beside it."""
-        found = list[Said]()
+        found = list[tasks.Said]()
         for one, margin in zip(output, margins, strict=True):
             texts = _texts(one)
             deciding = [text for text in texts if has_word(text, truth) == (margin >= 0.0)] or texts
-            kept: JsonValue = {"texts": [*texts]} if len(texts) > 1 else None
+            kept: tasks.JsonValue = {"texts": [*texts]} if len(texts) > 1 else None
             found.append((_said(Counter(deciding).most_common(1)[0][0]), kept))
         return found
 

@@ -11,14 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.errors import FileFormatError, InputError
-from advsearch.models import Model
-from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.inputs import WithState
-from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Facts, Prediction, Said, Task
-from advsearch.trust import stored_files
-from advsearch.trust.stored_files import parse_json
+from advsearch.extend import Facts, FileFormatError, InputError, Model, Prediction, Task, models, stored_files, tasks
 
 Numbers = tuple[float, ...]
 
@@ -58,7 +51,7 @@ class Command(Task):
     envelope: Any = None
     names: Any = ()
     units: Any = ()
-    clean: Tensor | None = field(default=None, compare=False, repr=False, metadata=FROM_RUN)  # (A,)
+    clean: Tensor | None = field(default=None, compare=False, repr=False, metadata=tasks.FROM_RUN)  # (A,)
 
     def __post_init__(self) -> None:
         put = object.__setattr__  # what files and lists say, in the one form that compares and is written down
@@ -80,11 +73,11 @@ class Command(Task):
                 raise InputError(f"task command: envelope: expected numbers over 0, got {min(self.envelope):g}")
 
     def wrapped(self, network: Callable[..., Any]) -> Callable[..., Any]:
-        if isinstance(network, AllAtOnce):
+        if isinstance(network, models.AllAtOnce):
             inner: Any = self.wrapped(network.network)
-            return AllAtOnce(inner, network.cameras, network.layout)
-        alone = network.network if isinstance(network, WithState) else network
-        return WithState(alone, self.state) if self.state or hasattr(alone, "select_action") else network
+            return models.AllAtOnce(inner, network.cameras, network.layout)
+        alone = network.network if isinstance(network, models.WithState) else network
+        return models.WithState(alone, self.state) if self.state or hasattr(alone, "select_action") else network
 
     def read(self, returned: Any, count: int) -> Tensor:
         """Return actions (count, A) of (count, A) or (count,), which may be the first of a tuple, or `action` of a
@@ -192,11 +185,11 @@ class Command(Task):
     def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:
         return [(Prediction(self._said(action)),) for action in output.tolist()]
 
-    def said(self, output: Tensor, truth: Tensor | None, margins: Sequence[float]) -> list[Said]:
+    def said(self, output: Tensor, truth: Tensor | None, margins: Sequence[float]) -> list[tasks.Said]:
         """See `Task.said`: whether an action left its envelope, and which element is furthest out. Beside it stand the
         action and the clean one, also in words, and how many envelopes lie between them."""
         assert truth is not None
-        found: list[Said] = []
+        found: list[tasks.Said] = []
         reached = [False] * len(output) if self.target is None else self.loss(output, self.target) <= 0.0
         for off, action, margin, hit in zip(self._off(output, truth), output.tolist(), margins, reached, strict=True):
             furthest = int(off.abs().argmax())
@@ -242,7 +235,9 @@ def _state(given: Any) -> dict[str, Numbers]:
     if isinstance(given, (str, Path)) and str(given):
         path = Path(given).expanduser()
         try:
-            given = parse_json(stored_files.read_text(path, "a state: numbers by name in JSON", LARGEST), finite=True)
+            given = stored_files.parse_json(
+                stored_files.read_text(path, "a state: numbers by name in JSON", LARGEST), finite=True
+            )
         except OSError as error:
             raise FileFormatError(f"task command: state: {path} cannot be read ({error.strerror or error})") from None
         except ValueError as error:

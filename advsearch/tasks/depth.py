@@ -18,11 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.errors import InputError
-from advsearch.files import JsonValue
-from advsearch.models import Model
-from advsearch.options import FROM_RUN, NOT_A_NUMBER, OUT_OF_VIEW
-from advsearch.tasks.base import Facts, Mark, Prediction, Said, Task
+from advsearch.extend import Facts, InputError, Model, Prediction, Task, tasks
 
 ASIDE = 0.1  # cosine of the angle to the camera's axis from which on z-depth is no distance any more
 DISPARITY, RELATIVE, METRIC = "relative disparity", "relative depth", "metric depth"
@@ -124,8 +120,10 @@ class Depth(Task):
     kind: str = ""
     size: float = 0.0
     seek: str = ""
-    seen_kind: str = field(default="", metadata=FROM_RUN)  # what the network says
-    missing: str = field(default="", metadata=FROM_RUN)  # what its user has to say before predictions can be judged
+    seen_kind: str = field(default="", metadata=tasks.FROM_RUN)  # what the network says
+    missing: str = field(
+        default="", metadata=tasks.FROM_RUN
+    )  # what its user has to say before predictions can be judged
 
     def __post_init__(self) -> None:
         self.check_numbers(lambda value: 0.0 < value < LARGEST, "a number over 0, under 100", "tolerance")
@@ -303,20 +301,20 @@ class Depth(Task):
             ((said, values),) = one.items()
             low, high = (float(end) for end in values.detach().aminmax())
             text = f"{self.kind or said or 'numbers'} from {low:.3g} to {high:.3g}"
-            found.append((Prediction(text if math.isfinite(low + high) else NOT_A_NUMBER),))
+            found.append((Prediction(text if math.isfinite(low + high) else tasks.NOT_A_NUMBER),))
         return found
 
-    def said(self, output: Sequence[Map], truth: Distances, margins: Sequence[float]) -> list[Said]:
+    def said(self, output: Sequence[Map], truth: Distances, margins: Sequence[float]) -> list[tasks.Said]:
         """See `Task.said`; the payload has the factor by which the distance is off, what is left of the relief, and
         where scale and shift were found."""
         if not truth.seen:
-            return [(Prediction(OUT_OF_VIEW), None)] * len(output)
-        found: list[Said] = []
+            return [(Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
+        found: list[tasks.Said] = []
         distance = float(truth.z[truth.mask].double().log().mean().exp())
         for one, margin in zip(output, margins, strict=True):
             factors = self._factors(one, truth)
             mean, relief = float(factors.mean()), float(self._relief(factors, truth))
-            payload: dict[str, JsonValue] = {
+            payload: dict[str, tasks.JsonValue] = {
                 "distance": round(distance, 4),
                 "judged": round(distance * math.exp(mean), 4),
                 "factor": round(math.exp(float(factors.abs().mean())), 4),
@@ -330,18 +328,18 @@ class Depth(Task):
             found.append((Prediction(AS_FAR if margin >= 0.0 else wrong), payload))
         return found
 
-    def marks(self, output: Sequence[Map], truth: Distances) -> list[list[Mark]]:
+    def marks(self, output: Sequence[Map], truth: Distances) -> list[list[tasks.Mark]]:
         """See `Task.marks`: the object, its pixels of which the distance is right, and the disparity of everything."""
         found = []
         for one in output:
-            marks = [Mark("disparity", True, mask=truth.mask, map=truth.z.reciprocal())]
+            marks = [tasks.Mark("disparity", True, mask=truth.mask, map=truth.z.reciprocal())]
             kind = self.kind or next(iter(one))
             if truth.seen and not self._missing(kind, truth if kind == METRIC else None):
                 right = torch.zeros_like(truth.mask)
                 right[truth.mask] = (self._factors(one, truth).detach().abs() <= self._bar).to(right.device)
                 judged, inverse = self._judged(one, truth)
                 near = judged if inverse else judged.clamp_min(1.0 / LARGEST).reciprocal()
-                marks.append(Mark("disparity", False, mask=right, map=near.detach().cpu()))
+                marks.append(tasks.Mark("disparity", False, mask=right, map=near.detach().cpu()))
             found.append(marks)
         return found
 

@@ -10,20 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.errors import InputError
-from advsearch.files import JsonValue
-from advsearch.models import Model
-from advsearch.models.all_at_once import AllAtOnce
-from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Facts, Judgement, Mark, Prediction, Task, Truth
-from advsearch.tasks.together import Joined, Outputs, Truths, all_said, outcome_in
+from advsearch.extend import Facts, InputError, Judgement, Model, Prediction, Task, models, tasks
 
 RULES = ("any", "all", "mean", "vote")
 """When the rig is right: in any picture, in all, on average of the losses, or in more than half."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rig(Joined):
+class Rig(tasks.Joined):
     """Several cameras take pictures of one configuration, and one prediction is made of what a model says of each.
 
     Each picture has a truth of its own, such as the box in it. The loss of the rig is the least, the largest or the
@@ -42,8 +36,8 @@ class Rig(Joined):
 
     task: Any = "classification"
     rule: str = RULES[0]
-    part: Any = field(default=None, metadata=FROM_RUN)  # the task on the model
-    cameras: int = field(default=1, metadata=FROM_RUN)  # how many there are
+    part: Any = field(default=None, metadata=tasks.FROM_RUN)  # the task on the model
+    cameras: int = field(default=1, metadata=tasks.FROM_RUN)  # how many there are
 
     def __post_init__(self) -> None:
         if self.rule not in RULES:
@@ -69,7 +63,7 @@ class Rig(Joined):
         if model.cameras < 2:
             raise InputError("task rig: expected a rig, got one camera; give it with `camera=rig.yaml`")
         part = self.part.on(replace(model, cameras=1), target=target, minimise=minimise)
-        if part.needs_all_images and not isinstance(model.module, AllAtOnce):
+        if part.needs_all_images and not isinstance(model.module, models.AllAtOnce):
             raise InputError(
                 "task rig: task command is of one action for all pictures; give a policy that takes them at once, as "
                 "advsearch.models.all_at_once.AllAtOnce"
@@ -85,23 +79,23 @@ class Rig(Joined):
     def read(self, returned: Any, count: int) -> Any:
         return returned
 
-    def after_calibration(self, output: Sequence[Outputs], truth: Truths | None) -> Rig:
+    def after_calibration(self, output: Sequence[tasks.Outputs], truth: tasks.Truths | None) -> Rig:
         return replace(self, part=self.part.after_calibration(output[0][0], None if truth is None else truth[0]))
 
-    def truth(self, facts: Facts) -> Truths:
+    def truth(self, facts: Facts) -> tasks.Truths:
         return tuple(self.part.truth(view) for view in facts.views or (facts,) * self.cameras)
 
-    def loss(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
+    def loss(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> Tensor:
         return self._ruled(self._each("loss", output, truth))
 
-    def score(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
+    def score(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> Tensor:
         """See `Task.score`: a target is reached, and a right prediction made, by the rule."""
         scores = self._each("score", output, truth)
         return -self._ruled(-scores) if self.target is not None or self.minimise else self._ruled(scores)
 
-    def _each(self, value: str, output: Sequence[Outputs], truth: Truths) -> Tensor:
+    def _each(self, value: str, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> Tensor:
         """A number of each picture, (N, K)."""
-        of_picture: Callable[[Any, Truth], Tensor] = getattr(self.part, value)
+        of_picture: Callable[[Any, tasks.Truth], Tensor] = getattr(self.part, value)
         each = [[of_picture(*judged) for judged in zip(pictures, truth, strict=True)] for pictures in output]
         return torch.stack([torch.cat(values) for values in each])
 
@@ -112,29 +106,29 @@ class Rig(Joined):
         place = {"any": 0, "all": wrong.shape[1] - 1, "vote": wrong.shape[1] // 2}[self.rule]
         return wrong.sort(dim=1).values[:, place]
 
-    def predictions(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Prediction, ...]]:
-        return [(all_said(self.part.predictions(picture)[0][0] for picture in each),) for each in output]
+    def predictions(self, output: Sequence[tasks.Outputs], count: int = 1) -> list[tuple[Prediction, ...]]:
+        return [(tasks.all_said(self.part.predictions(picture)[0][0] for picture in each),) for each in output]
 
-    def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
+    def judge(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> list[Judgement]:
         with torch.no_grad():
             margins, scores = (0.0 - self.loss(output, truth)).tolist(), self.score(output, truth).tolist()
         judgements = []
         for pictures, margin, score in zip(output, margins, scores, strict=True):
             each = [self.part.judge(*judged)[0] for judged in zip(pictures, truth, strict=True)]
             margin = math.nan if any(judged.not_a_number for judged in each) else margin
-            kept: list[JsonValue] = [
+            kept: list[tasks.JsonValue] = [
                 {"prediction": judged.prediction.label, "right": judged.right, "payload": judged.payload}
                 for judged in each
             ]
-            prediction = all_said(judged.prediction for judged in each)
+            prediction = tasks.all_said(judged.prediction for judged in each)
             # the picture by which the rule decides; of the mean, the worst one
             deciding = min(
                 each, key=lambda judged: judged.margin if self.rule == "mean" else abs(judged.margin - margin)
             )
-            judgements.append(Judgement.of(score, margin, prediction, {"pictures": kept, **outcome_in(deciding)}))
+            judgements.append(Judgement.of(score, margin, prediction, {"pictures": kept, **tasks.outcome_in(deciding)}))
         return judgements
 
-    def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
+    def marks(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> list[list[tasks.Mark]]:
         """See `Task.marks`: those of the first picture, which is at the left."""
 
         def widened(mask: Tensor | None) -> Tensor | None:

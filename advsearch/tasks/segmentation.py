@@ -11,15 +11,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.options import NOT_A_NUMBER, OUT_OF_VIEW, OUTCOME, Outcome
-from advsearch.tasks.base import Facts, Mark, Prediction, Said
-from advsearch.tasks.classification import NO, ClassTask, Labels, members, target_lead, wrong_lead
+from advsearch.extend import Facts, Prediction, tasks
 
 EXPECTED = "expected logits (N, classes, height, width), or a mapping with these under 'out' or 'logits'"
 
 LEAST_ACCURACY = 0.1  # fraction of the object's pixels from which on it is seen in part
 
-Lead = Callable[[Tensor, Labels], Tensor]
+Lead = Callable[[Tensor, tasks.Labels], Tensor]
 
 
 @dataclass(frozen=True)
@@ -27,7 +25,7 @@ class Region:
     """What is to be segmented in a picture, the truth of segmentation: indices of the right classes, and (H, W) bool,
     the pixels in which the object is seen."""
 
-    labels: Labels
+    labels: tasks.Labels
     mask: Tensor
 
     def at(self, size: tuple[int, int]) -> Tensor:
@@ -41,7 +39,7 @@ class Region:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Segmentation(ClassTask):
+class Segmentation(tasks.ClassTask):
     """A model gives at least `accuracy` of the object's pixels a right class. Pixels beside the object don't count.
 
     Where the object is not seen at all there is nothing to segment, and every prediction is right. Raises InputError:
@@ -82,13 +80,13 @@ class Segmentation(ClassTask):
     def loss(self, output: Tensor, truth: Region) -> Tensor:
         """Return, in logits (N,), the wrong classes' lead at the pixel that decides: over 0 where too few are right. Of
         the object's pixels in the order of that lead it is the one at which `accuracy` of them is reached."""
-        return self._deciding(output, truth, wrong_lead, truth.labels)
+        return self._deciding(output, truth, tasks.wrong_lead, truth.labels)
 
     def score(self, output: Tensor, truth: Region) -> Tensor:
         """See `Task.score`; with a target, enough of the object's pixels have to be given that."""
         if self.target is None:
             return super().score(output, truth)
-        return -self._deciding(output, truth, lambda logits, labels: -target_lead(logits, labels), self.target)
+        return -self._deciding(output, truth, lambda logits, labels: -tasks.target_lead(logits, labels), self.target)
 
     def pixel_margin(self, output: Tensor, truth: Region) -> Tensor:
         """Return the mean over the object's pixels of what is sought: the lead of wrong classes, or of the target's. In
@@ -96,11 +94,11 @@ class Segmentation(ClassTask):
         pixels = self._pixels(output, truth)
         if pixels is None:
             return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0
-        lead = wrong_lead(pixels, truth.labels) if self.target is None else target_lead(pixels, self.target)
+        lead = tasks.wrong_lead(pixels, truth.labels) if self.target is None else tasks.target_lead(pixels, self.target)
         mean = lead.reshape(len(output), -1).mean(dim=1)
         return -mean if self.minimise else mean
 
-    def _deciding(self, output: Tensor, truth: Region, lead: Lead, labels: Labels) -> Tensor:
+    def _deciding(self, output: Tensor, truth: Region, lead: Lead, labels: tasks.Labels) -> Tensor:
         """The lead at the pixel at which `accuracy` of them is reached, (N,)."""
         pixels = self._pixels(output, truth)
         if pixels is None:
@@ -126,45 +124,47 @@ class Segmentation(ClassTask):
             shares, indices = counts.topk(min(count, len(one)))
             rows = zip(indices.tolist(), shares.tolist(), strict=True)
             listed = tuple(Prediction(self.name_of(i), i, n / one[0].numel()) for i, n in rows if n)
-            found.append(listed or (Prediction("nothing" if len(said) else NOT_A_NUMBER),))
+            found.append(listed or (Prediction("nothing" if len(said) else tasks.NOT_A_NUMBER),))
         return found
 
-    def said(self, output: Tensor, truth: Region, margins: Sequence[float]) -> list[Said]:
+    def said(self, output: Tensor, truth: Region, margins: Sequence[float]) -> list[tasks.Said]:
         """See `Task.said`. The prediction is the class of most of the object's pixels; a wrong one where too few are
         right, and where most of these are background "no bottle", or "bottle in part" from `LEAST_ACCURACY` on. Its
         probability is the share of the object's pixels that are right. Beside it stand the outcome, shares of the
         pixels by class, and the overlap."""
-        found: list[Said] = []
+        found: list[tasks.Said] = []
         mask = truth.at((output.shape[2], output.shape[3])).to(output.device)
         for logits, margin in zip(output, margins, strict=True):
             pixels = self._pixels(logits[None], truth)
             if pixels is None:
-                found.append((Prediction(OUT_OF_VIEW), None))
+                found.append((Prediction(tasks.OUT_OF_VIEW), None))
                 continue
             right, hits = margin >= 0.0, self._correct(logits, truth)
             counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
-            first = int(counts.masked_fill(members(pixels, truth.labels) != right, -1).argmax())
+            first = int(counts.masked_fill(tasks.members(pixels, truth.labels) != right, -1).argmax())
             accuracy, overlap = float(hits[mask].float().mean()), float((hits & mask).sum() / (hits | mask).sum())
             said = Prediction(self.name_of(first), first, accuracy)
-            outcome = Outcome.FOUND if right else Outcome.WRONG_CLASS
+            outcome = tasks.Outcome.FOUND if right else tasks.Outcome.WRONG_CLASS
             if not right and first in self.nothing:
                 name = self.name_of(truth.labels[0])
                 is_partly_right = accuracy >= LEAST_ACCURACY
-                outcome = Outcome.LOOSE if is_partly_right else Outcome.MISSED
-                said = Prediction(f"{name} in part" if is_partly_right else f"{NO}{name}", None, accuracy)
+                outcome = tasks.Outcome.LOOSE if is_partly_right else tasks.Outcome.MISSED
+                said = Prediction(f"{name} in part" if is_partly_right else f"{tasks.NO}{name}", None, accuracy)
             shares = {self.name_of(i): round(n / len(pixels), 4) for i, n in enumerate(counts.tolist()) if n}
             numbers = {"accuracy": round(accuracy, 4), "iou": round(overlap, 4)}
-            found.append((said, {OUTCOME: outcome.value, **numbers, "pixels": shares}))
+            found.append((said, {tasks.OUTCOME: outcome.value, **numbers, "pixels": shares}))
         return found
 
     @staticmethod
     def _correct(logits: Tensor, truth: Region) -> Tensor:
         """Where the output (C, h, w) is a right class, (h, w) bool; a tie is right, NaN is not."""
         classes = logits.shape[0]
-        return (wrong_lead(logits.permute(1, 2, 0).reshape(-1, classes), truth.labels) <= 0.0).reshape(logits.shape[1:])
+        return (tasks.wrong_lead(logits.permute(1, 2, 0).reshape(-1, classes), truth.labels) <= 0.0).reshape(
+            logits.shape[1:]
+        )
 
-    def marks(self, output: Tensor, truth: Region) -> list[list[Mark]]:
+    def marks(self, output: Tensor, truth: Region) -> list[list[tasks.Mark]]:
         """See `Task.marks`: the object, and the pixels that are given a right class."""
         name = " or ".join(self.names(truth.labels))
-        true = Mark(name, True, mask=truth.mask)
-        return [[true, Mark(name, False, mask=self._correct(one, truth))] for one in output.detach()]
+        true = tasks.Mark(name, True, mask=truth.mask)
+        return [[true, tasks.Mark(name, False, mask=self._correct(one, truth))] for one in output.detach()]

@@ -16,15 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.errors import InputError
-from advsearch.files import JsonValue
-from advsearch.models import Model
-from advsearch.models.zoo.outputs import PARTS, pooled
-from advsearch.options import FROM_RUN
-from advsearch.pictures import upright
-from advsearch.tasks.base import Facts, Judgement
-from advsearch.tasks.classification import Classification, Labels
-from advsearch.trust.stored_files import scaled, too_large
+from advsearch.extend import Facts, InputError, Judgement, Model, models, stored_files, tasks
 
 MOST = 10_000  # pictures of a gallery, before `scaled`
 SIDE = 1024  # longest side in pixels of a picture as it is kept; larger ones are averaged down
@@ -81,10 +73,12 @@ def embedded(folder: str, model: Model, *, linear: bool) -> Gallery:
         if not pictures:
             raise InputError(f"references: expected pictures of {name} in {where}, got none; put some there")
         paths += [(number, picture) for picture in pictures]
-    if len(paths) > scaled(MOST):
-        raise too_large(root, f"at most {scaled(MOST):,} reference pictures", f"{len(paths):,}")
+    if len(paths) > stored_files.scaled(MOST):
+        raise stored_files.too_large(
+            root, f"at most {stored_files.scaled(MOST):,} reference pictures", f"{len(paths):,}"
+        )
     parts: list[Tensor] = []
-    shown = (_cut(torch.from_numpy(upright(path, SIDE)), model.input_size) for _, path in paths)
+    shown = (_cut(torch.from_numpy(models.upright(path, SIDE)), model.input_size) for _, path in paths)
     with torch.no_grad():
         for _, of_one_size in itertools.groupby(shown, key=lambda picture: picture.shape):
             while batch := list(itertools.islice(of_one_size, AT_ONCE)):
@@ -168,7 +162,7 @@ ITSELF, ELSE = "itself", "something else"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Similarity(Classification):
+class Similarity(tasks.Classification):
     """The object is what the nearest reference pictures show, or what the clean picture shows.
 
     The output is features (N, D), whatever their length. With `references` the truth is the indices of the right names,
@@ -200,8 +194,8 @@ class Similarity(Classification):
     method: str = METHODS[0]
     k: int = 1
     threshold: float | None = None
-    gallery: Gallery | None = field(default=None, compare=False, repr=False, metadata=FROM_RUN)
-    clean: Tensor | None = field(default=None, compare=False, repr=False, metadata=FROM_RUN)  # (D,), of length 1
+    gallery: Gallery | None = field(default=None, compare=False, repr=False, metadata=tasks.FROM_RUN)
+    clean: Tensor | None = field(default=None, compare=False, repr=False, metadata=tasks.FROM_RUN)  # (D,), of length 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -236,7 +230,7 @@ class Similarity(Classification):
     def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
         return tuple(name for name, _ in folders_of(self.references)) if self.references else (ITSELF, ELSE), True
 
-    def right_classes(self, facts: Facts) -> Labels:
+    def right_classes(self, facts: Facts) -> tasks.Labels:
         """See `ClassTask.right_classes`; with a threshold the clean picture says what is right."""
         if self.references:
             return super().right_classes(facts)
@@ -248,15 +242,15 @@ class Similarity(Classification):
     def calibrates(self) -> bool:
         return not self.references and self.clean is None
 
-    def after_calibration(self, output: Tensor, truth: Labels | None) -> Similarity:
+    def after_calibration(self, output: Tensor, truth: tasks.Labels | None) -> Similarity:
         return replace(self, clean=functional.normalize(output.detach().float(), dim=1)[0]) if self.calibrates else self
 
     def read(self, returned: Any, count: int) -> Tensor:
         """Return features (count, D): a tensor, the first of a tuple, or the first of `PARTS` that is there. Of
         `last_hidden_state` that is the first token (CLS); a map is averaged over its positions."""
-        found = pooled(returned[0] if type(returned) in (tuple, list) and returned else returned, token=True)
+        found = models.pooled(returned[0] if type(returned) in (tuple, list) and returned else returned, token=True)
         if found is None or found.dim() != 2 or found.shape[0] != count:
-            raise ValueError(f"expected features ({count}, D), or what has one of {', '.join(PARTS)}")
+            raise ValueError(f"expected features ({count}, D), or what has one of {', '.join(models.PARTS)}")
         return found.float()
 
     def logits(self, output: Tensor) -> Tensor:
@@ -277,10 +271,10 @@ class Similarity(Classification):
             scores = torch.stack([of_name.mean(dim=1) for of_name in nearest], dim=1)
         return scores / TEMPERATURE
 
-    def as_logits(self, output: Tensor, truth: Labels) -> Tensor:
+    def as_logits(self, output: Tensor, truth: tasks.Labels) -> Tensor:
         return super().as_logits(self.logits(output), truth)
 
-    def judge(self, output: Tensor, truth: Labels) -> list[Judgement]:
+    def judge(self, output: Tensor, truth: tasks.Labels) -> list[Judgement]:
         """See `Task.judge`; the payload has the cosine to the clean picture, or what `_ranked` says."""
         with torch.no_grad():
             judged, features = super().judge(output, truth), functional.normalize(output, dim=1)
@@ -294,7 +288,9 @@ class Similarity(Classification):
             for one, payload in zip(judged, kept, strict=True)
         ]
 
-    def _ranked(self, gallery: Gallery, features: Tensor, logits: Tensor, truth: Labels) -> list[dict[str, JsonValue]]:
+    def _ranked(
+        self, gallery: Gallery, features: Tensor, logits: Tensor, truth: tasks.Labels
+    ) -> list[dict[str, tasks.JsonValue]]:
         """Say of each of N pictures where the right one stands. Each has the `rank` of the nearest right reference
         among all (1 where it is the nearest of all) and its `cosine`; `name_rank`, that of the right name by its logit;
         and the `nearest` reference of all and its cosine."""

@@ -2,7 +2,7 @@
 
 The threat: a file makes a program hang, wait for somebody to type, or find settings and modules of the user's.
 
-Used for OpenUSD (`scene/importing/usd.py`) and Blender (`scene/importing/blender.py`).
+Used for OpenUSD (`scene/importing/usd`) and Blender (`scene/importing/blender.py`).
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from samples import make_attacked
 from small_models import easy
 
 import advsearch
-from advsearch.api.dataset import _runs
+from advsearch.cli.exporters.dataset.files import find_runs
 from advsearch.cli.main import main
 from advsearch.questions.attack.carry_out import parts_in, problem_of_parts
 from advsearch.questions.attack.settings import AttackConfig
@@ -67,7 +67,7 @@ def rows_of(run: Path) -> list[Row]:
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_runs_come_back_as_the_mask(share: float) -> None:
     mask = np.random.default_rng(3).random((5, 7)) < share
-    counts = _runs(mask)
+    counts = find_runs(mask)
     assert sum(counts) == mask.size and all(counts[1:])
     assert (decoded({"size": [5, 7], "counts": counts}) == mask).all()
 

@@ -14,7 +14,7 @@ from samples import make_attacked
 from scipy.spatial import KDTree
 
 import advsearch
-from advsearch.api.export import adversarial_of
+from advsearch.api.export import AdversarialRun
 from advsearch.cli.main import main
 from advsearch.controls import make_control, make_space
 from advsearch.questions.attack.result import write_object
@@ -52,7 +52,7 @@ def test_stock_mitsuba_renders_the_adversarial_scene(
     assert main(command) == 2
     assert "is there already" in capsys.readouterr().err
 
-    answer = adversarial_of(run)
+    answer = AdversarialRun.load(run)
     renderer = answer.problem.renderer.like(denoiser="none")
     ours, again = (renderer.radiance(answer.u, seed, 128).numpy() for seed in (0, 1))
     mi = mitsuba()
@@ -87,7 +87,7 @@ def test_stock_mitsuba_renders_haze_and_a_plain_background(
     run = answered_by(controls, tmp_path / "mug-001")
     assert main(["export", str(run), "--out", str(tmp_path / "scene.xml"), "--json"]) == 0
     note = json.loads(capsys.readouterr().out)["notes"][2]
-    answer = adversarial_of(run)
+    answer = AdversarialRun.load(run)
     renderer = answer.problem.renderer
     ours, again = (renderer.radiance(answer.u, seed, 128).numpy() for seed in (0, 1))
     mi = mitsuba()
@@ -133,7 +133,7 @@ def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: 
     out = tmp_path / "mug.glb"
     assert main(["export", str(run), "--out", str(out), "--json"]) == 0
     assert "8 bits" in json.loads(capsys.readouterr().out)["notes"][0]
-    answer = adversarial_of(run)
+    answer = AdversarialRun.load(run)
     inputs, description = answer.inputs, answer.problem.space.scene
     assert description is not None
     texture = np.round(linear_to_srgb(inputs["object.base_color"]).numpy() * 255)
@@ -162,7 +162,7 @@ def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: 
 
 
 def test_the_object_to_turn_is_the_adversarial_scene_and_what_was_before(run: Path, tmp_path: Path) -> None:
-    answer = adversarial_of(run)
+    answer = AdversarialRun.load(run)
     with RunDirectory.create_for(AttackConfig(object="mug", run=str(tmp_path / "kept"))) as kept:
         write_object(kept, answer.problem, answer.u)
     read = trimesh.load(tmp_path / "kept" / OBJECT_FILE, process=False, force="mesh")

@@ -14,9 +14,9 @@ from PIL import Image
 from scipy import stats
 from torch import Tensor
 
-from advsearch.controls import corruption, corruption_filters, make_space
-from advsearch.controls.corruption import NAMES, STEPPED, CorruptionControl, corrupted
-from advsearch.controls.corruption_filters import blurred, fractal, poisson
+from advsearch.controls import corruption, make_space
+from advsearch.controls.corruption import NAMES, STEPPED, CorruptionControl, corrupted, filters
+from advsearch.controls.corruption.filters import blurred, fractal, poisson
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription, describe
 
@@ -123,14 +123,14 @@ def test_the_start_has_a_slope_for_every_corruption() -> None:
 def test_the_noises_are_as_strong_as_published(whole: int) -> None:
     image, severity = torch.full((224, 224, 3), 0.5), number(float(whole))
     level = severity
-    (sigma,) = corruption_filters.GAUSSIAN[whole - 1]
-    raw = corruption_filters.gaussian_noise(image, level, 0)
+    (sigma,) = filters.GAUSSIAN[whole - 1]
+    raw = filters.gaussian_noise(image, level, 0)
     assert float(raw.std()) == pytest.approx(sigma, rel=0.02) and float(raw.mean()) == pytest.approx(0.5, abs=0.005)
-    (photons,) = corruption_filters.SHOT[whole - 1]
-    raw = corruption_filters.shot_noise(image, level, 0)
+    (photons,) = filters.SHOT[whole - 1]
+    raw = filters.shot_noise(image, level, 0)
     assert float(raw.std()) == pytest.approx(math.sqrt(0.5 / photons), rel=0.02)
     assert float(((raw * photons) - (raw * photons).round()).abs().max()) < 1e-3, "whole photons"
-    (lost,) = corruption_filters.IMPULSE[whole - 1]
+    (lost,) = filters.IMPULSE[whole - 1]
     seen = corrupted(image, "impulse_noise", severity)
     assert float((seen != 0.5).float().mean()) == pytest.approx(lost, rel=0.05)
     assert float((seen == 1.0).float().mean()) == pytest.approx(lost / 2.0, rel=0.1)
@@ -148,7 +148,7 @@ def test_impulse_noise_has_the_slope_of_its_average() -> None:
     image, weights = scenery(), scenery().flip(0) - 0.5
     at = torch.tensor(3.5, requires_grad=True)
     (corrupted(image, "impulse_noise", at) * weights).sum().backward()
-    gain = corruption_filters.IMPULSE[3][0] - corruption_filters.IMPULSE[2][0]
+    gain = filters.IMPULSE[3][0] - filters.IMPULSE[2][0]
     assert at.grad is not None
     assert float(at.grad) == pytest.approx(float((gain * (0.5 - image) * weights).sum()), abs=4.0)
 
@@ -239,7 +239,7 @@ def test_fractal_noise_fills_its_range_and_wraps_around() -> None:
 
 
 def test_the_tables_have_five_rows() -> None:
-    for module in (corruption_filters, corruption):
+    for module in (filters, corruption):
         tables = {name: table for name, table in vars(module).items() if name.isupper() and isinstance(table, tuple)}
         for other in ("NAMES", "ICE", "LUMA"):
             tables.pop(other, None)

@@ -15,18 +15,17 @@ import advsearch
 from advsearch.controls import make_space
 from advsearch.controls.camera import CameraControl
 from advsearch.controls.occlusion import BUNDLED, OPTIONS, OcclusionControl, Placement, loaded, made
+from advsearch.controls.occlusion.silhouettes import Passage, middle_axes, silhouette
 from advsearch.controls.pose import PoseControl
-from advsearch.controls.support.meshes import sphere
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.camera_model import bundled, pinhole
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.geometry import Frame, camera_to_world, object_to_world
 from advsearch.scene.library import list_objects
 from advsearch.scene.mitsuba_backend.parts import translation
 from advsearch.scene.mitsuba_backend.variant import mitsuba
-from advsearch.scene.parts import MeshPart
+from advsearch.scene.parts import MeshPart, sphere
 from advsearch.scene.raster import pixels_in
-from advsearch.scene.silhouettes import Frame, Passage, middle_axes, silhouette
 
 ACCURACY = 0.02
 """Allowed error of a hidden share: silhouettes have 128 pixels along their longer side."""

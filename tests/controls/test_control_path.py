@@ -16,11 +16,11 @@ from torch import Tensor
 import advsearch
 from advsearch.controls import Control, make_space
 from advsearch.controls.path import CLEAN_AT, PATHS, PathControl, start_of
+from advsearch.controls.path.pose_files import SENSOR_AXES, WORLD_TO_Z_UP
 from advsearch.engine.rendering import sight_of
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world, middle, object_to_world
-from advsearch.scene.pose_files import SENSOR_AXES, WORLD_TO_Z_UP
 from advsearch.tasks import Facts
 
 WAY = "time, x, y, z\n3, 2, 0, 1\n4, 2, 2, 1\n7, -2, 2, 1\n"

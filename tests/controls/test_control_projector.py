@@ -14,9 +14,9 @@ from samples import make_attacked
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.projection import write_projection
+from advsearch.cli.exporters.projection.images import write_projection
 from advsearch.controls import make_control
-from advsearch.controls.projector import AMBIENT, ProjectorControl, ambient_irradiance
+from advsearch.controls.projector.projector import AMBIENT, ProjectorControl
 from advsearch.controls.space import Space
 from advsearch.engine.gradients import interior_point
 from advsearch.errors import InputError
@@ -71,7 +71,7 @@ def test_white_puts_its_lumens_over_its_area_on_what_faces_it() -> None:
     assert described["projector.white"]["value"] == pytest.approx(lux)
     assert described["projector.beside_ambient"]["value"] == pytest.approx(lux / 50.0)
     farther = (3.0 / (3.0 + middle(scene)[2])) ** 2  # the ground is below the middle
-    expected = lux / 50.0 * ambient_irradiance(scene) / math.pi * farther
+    expected = lux / 50.0 * scene.metered_irradiance / math.pi * farther
     camera = camera_to_world(scene)
     x, y, z = -camera[:3, 3] @ camera[:3, :3]
     scale = SIDE / 2.0 / math.tan(math.radians(scene.number("camera.fov") / 2.0)) / z

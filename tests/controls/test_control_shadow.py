@@ -14,9 +14,9 @@ import advsearch
 from advsearch.controls import make_control
 from advsearch.controls.shadow import strongest_light
 from advsearch.controls.space import Space
-from advsearch.controls.support.meshes import polygon
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world, middle
+from advsearch.scene.parts import polygon
 from advsearch.scene.renderer import Renderer
 
 SIDE = 32

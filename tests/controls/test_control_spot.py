@@ -10,9 +10,9 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import make_control
-from advsearch.controls.projector import ProjectorControl, out_of_focus
+from advsearch.controls.projector import ProjectorControl, SpotControl
+from advsearch.controls.projector.projector import out_of_focus
 from advsearch.controls.space import Space
-from advsearch.controls.spot import SpotControl
 from advsearch.scene.renderer import Renderer
 
 SIDE = 24

@@ -15,8 +15,8 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.questions.sweep.axes import on_grid, read_axes
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.geometry import footprint, overlapping
 from advsearch.scene.parts import Footprint
-from advsearch.scene.things import footprint, overlapping
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

@@ -296,7 +296,7 @@ UNTOUCHED: dict[Any, set[str]] = {
     Policy: {"propose", "takes_differences", "counts", "distribution", "failures"},
     NumberControl: {
         *("declared", "setting", "settings", "chosen_form", "mesh_in", "within", "allowed", "searches", "in_scene"),
-        *("resting", "unchanged", "spec", "budget_of", "left_out", "values", "later", "in_light"),
+        *("resting", "unchanged", "spec", "budget_of", "is_compared", "note_moved", "values", "later", "in_light"),
     },
 }
 """Methods that get no tensors which anybody else reads; those of a declaration get the control's copy of a scene."""

@@ -573,7 +573,7 @@ def test_the_start_is_the_scene_as_it_is() -> None:
 
 
 def test_a_rotation_vector_is_a_rotation_with_a_derivative_at_zero() -> None:
-    from advsearch.controls.support.rotations import euler, rotation_vector
+    from advsearch.scene.geometry import euler, rotation_vector
 
     for degrees in ([0.0, 0.0, 0.0], [0.0, 0.0, 90.0], [100.0, -60.0, 45.0], [180.0, 0.0, 0.0]):
         vector = torch.tensor(degrees, requires_grad=True)

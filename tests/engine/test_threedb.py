@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from stored_sweeps import make_sweep
 
+from advsearch.cli.exporters.threedb import write_threedb
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError
 from advsearch.questions.sweep.result import import_threedb
-from advsearch.runs.export import write_threedb
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer.thumbnails import kept_pictures
 

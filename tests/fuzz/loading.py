@@ -223,7 +223,7 @@ def load_blend(path: Path) -> None:
     import tempfile
     from unittest.mock import patch
 
-    from advsearch.scene.importing import blender
+    from advsearch.trust import programs
 
     def stand_in(command: list[str], **given: object) -> subprocess.CompletedProcess[str]:
         made, target = path.with_name("made.glb"), Path(command[-2])
@@ -234,7 +234,7 @@ def load_blend(path: Path) -> None:
 
     with (
         patch("advsearch.trust.programs.subprocess.run", stand_in),
-        patch.dict(os.environ, {blender.PROGRAM: sys.executable}),
+        patch.dict(os.environ, {programs.BLENDER: sys.executable}),
         patch.object(tempfile, "tempdir", str(path.parents[1] / "runs")),
     ):
         load_object(path)

@@ -15,7 +15,7 @@ from advsearch.errors import FileFormatError
 from advsearch.scene.description import describe
 from advsearch.scene.importing import blender
 from advsearch.scene.importing.objects import import_object
-from advsearch.trust.programs import BLENDER
+from advsearch.trust import programs
 
 STAND_IN = f"""#!{sys.executable}
 import json, os, shutil, sys
@@ -42,7 +42,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     monkeypatch.setenv("SECRET", "x")
-    monkeypatch.delenv(BLENDER, raising=False)
+    monkeypatch.delenv(programs.BLENDER, raising=False)
     return tmp_path
 
 
@@ -89,7 +89,7 @@ def test_without_blender_the_command_to_type_is_said(folder: Path, monkeypatch: 
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(FileFormatError, match=r"none is installed; .*pip install bpy.*ADVSEARCH_BLENDER=.*export glTF"):
         import_object(folder / "room.blend")
-    monkeypatch.setenv(BLENDER, "nowhere/blender")
+    monkeypatch.setenv(programs.BLENDER, "nowhere/blender")
     with pytest.raises(FileFormatError, match="ADVSEARCH_BLENDER names nowhere/blender, which can't be run"):
         import_object(folder / "room.blend")
 

@@ -9,12 +9,11 @@ import torch
 from advsearch.engine.loading import load_scene
 from advsearch.scene import library
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.geometry import standing
+from advsearch.scene.geometry import footprint, overlapping, standing
 from advsearch.scene.grounds import LUMINANCE, enclosed, paved
 from advsearch.scene.places import crossing, room
 from advsearch.scene.places.avenue import KERB, StreetPlan, lamp_places
 from advsearch.scene.places.quads import FLOOR, ROAD
-from advsearch.scene.things import footprint, overlapping
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 

@@ -20,10 +20,10 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import things_as_text
 from advsearch.scene import library
 from advsearch.scene.description import describe
-from advsearch.scene.geometry import standing
+from advsearch.scene.geometry import blocked, footprint, overlapping, standing
 from advsearch.scene.outlines import seen_things
 from advsearch.scene.surface.renderer import why_not
-from advsearch.scene.things import AskedThing, asked_things, blocked, footprint, overlapping
+from advsearch.scene.things import AskedThing, asked_things
 from advsearch.scene.transport.matrix import LinearRenderer
 
 pytestmark = pytest.mark.usefixtures("two_threads")

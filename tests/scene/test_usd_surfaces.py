@@ -18,7 +18,7 @@ from advsearch.scene.glb import GlbBuffer
 from advsearch.scene.importing.objects import import_object, read_parts
 from advsearch.scene.importing.parts import ImportedPart
 
-usd_stage = pytest.importorskip("advsearch.scene.importing.usd_stage", exc_type=ImportError)
+usd_stage = pytest.importorskip("advsearch.scene.importing.usd.stage", exc_type=ImportError)
 
 SQUARE = "[(0,0,0), (1,0,0), (1,1,0), (0,1,0)]"
 STRETCHED = "[(-1,-1), (2,-1), (2,2), (-1,2)]"
@@ -194,7 +194,7 @@ def png_of_16_bits(values: np.ndarray, filters: list[int]) -> bytes:
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 def test_pictures_of_16_bits_are_linear_to_the_last_bit(channels: int) -> None:
-    from advsearch.scene.importing.usd_pictures import decode_picture, is_marked_srgb
+    from advsearch.scene.importing.usd.pictures import decode_picture, is_marked_srgb
 
     values = np.random.default_rng(4).integers(0, 65536, (5, 7, channels))
     data = png_of_16_bits(values, [0, 1, 2, 3, 4])

@@ -6,12 +6,15 @@ from collections.abc import Mapping
 from dataclasses import is_dataclass
 from typing import Any
 
-from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.candidates import Failures, FoundFailure, failure_share, most_different
+from advsearch.attacks.domain import centre_of_option, half_widths, wraps
+from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts, WithoutAscent
 from advsearch.attacks.policies.choices import Choices
 from advsearch.attacks.policies.evolution import CMAES, NES
 from advsearch.attacks.policies.pgd import PGD, Adam
 from advsearch.attacks.policies.sampling import Grid, Random, Sobol
+from advsearch.attacks.policies.surrogate import MOST_OWN, Observed, Surrogate, box_coordinates
 from advsearch.catalog import list_built_ins
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.options import check_options
@@ -67,6 +70,36 @@ def _nested(spec: Spec, where: str) -> Policy[Any]:
 
 
 __all__ = [
-    "CMAES", "NES", "PGD", "POLICIES", "Adam", "Auto", "Choices", "Evaluated", "Grid", "Policy", "Portfolio",
-    "Proposal", "Random", "Restarts", "Sobol", "Spec", "WithoutAscent", "draw_seed", "make_policy", "seeded",
-]  # fmt: skip
+    "CMAES",
+    "MOST_OWN",
+    "NES",
+    "PGD",
+    "POLICIES",
+    "Adam",
+    "Auto",
+    "Choices",
+    "Evaluated",
+    "Failures",
+    "FoundFailure",
+    "Grid",
+    "Observed",
+    "Policy",
+    "Portfolio",
+    "Proposal",
+    "Random",
+    "Restarts",
+    "Sobol",
+    "Spec",
+    "Surrogate",
+    "WithoutAscent",
+    "box_coordinates",
+    "centre_of_option",
+    "draw_seed",
+    "failure_share",
+    "half_widths",
+    "make_policy",
+    "most_different",
+    "one_thread",
+    "seeded",
+    "wraps",
+]

@@ -12,12 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.attacks.candidates import Failures, FoundFailure, most_different
-from advsearch.attacks.domain import Domain, half_widths, wraps
-from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
-from advsearch.attacks.policies.surrogate import MOST_OWN, Observed, Surrogate, box_coordinates
-from advsearch.errors import InputError, UnknownNameError
-from advsearch.seeds import stream
+from advsearch.extend import Domain, InputError, Policy, Proposal, UnknownNameError, policies, seeds
 
 MOST = 10_000  # more numbers are refused: every cell keeps a whole configuration
 MOST_CELLS = 1_000_000  # an archive has no more
@@ -50,7 +45,7 @@ class ArchiveState:
     points: Tensor
     values: tuple[float, ...] = ()
     wrong: tuple[bool, ...] = ()
-    seen: Observed | None = None
+    seen: policies.Observed | None = None
 
     def kept(self) -> ArchiveState:
         """Let a copy of the archive take in what is evaluated of a generation; what could not be has no cell."""
@@ -82,7 +77,7 @@ class ArchiveState:
                 points[:, part] = torch.where(anew[:, part], samples[:, part], first[:, part])
         return points
 
-    def likeliest(self, surrogate: Surrogate, points: Tensor, count: int) -> Tensor:
+    def likeliest(self, surrogate: policies.Surrogate, points: Tensor, count: int) -> Tensor:
         """Return (count, d) of the candidates (n, d), of different cells as long as there are: those that most likely
         fail where nothing fails yet. Where something does, being worse than it counts for `BETTER` as much."""
         mean, deviation = surrogate.predict(surrogate.space.take(points))
@@ -149,53 +144,55 @@ class MapElites(Policy[ArchiveState]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> ArchiveState:
         if domain.dim > MOST:
             raise InputError(f"policy 'archive': expected at most {MOST} numbers, got {domain.dim}; use pgd or auto")
-        seed, spanned = draw_seed(generator), self._spanned(domain)
+        seed, spanned = policies.draw_seed(generator), self._spanned(domain)
         dims = [options or self.cells for options in domain.options[spanned].tolist()]
         if math.prod(dims) > MOST_CELLS:
             raise InputError(f"cells: expected at most {MOST_CELLS} in all, got {math.prod(dims)}; set `cells` lower")
         from ribs import archives  # an extra, and it takes seconds
 
         archive = archives.GridArchive(
-            solution_dim=domain.dim, dims=dims, seed=stream(seed, "archive"),
+            solution_dim=domain.dim, dims=dims, seed=seeds.stream(seed, "archive"),
             ranges=list(zip(domain.lower[spanned].tolist(), domain.upper[spanned].tolist(), strict=True)),
             solution_dtype=np.float32, objective_dtype=np.float64, measures_dtype=np.float64,
             extra_fields={"wrong": ((), np.bool_)},
         )  # fmt: skip
-        first = [domain.begin[None], domain.sample(seeded(seed, 0), self.population - 1)]
-        box = box_coordinates(domain)
-        few = box.count == domain.dim <= MOST_OWN
-        seen = Observed(box, torch.empty(0, box.count), memory=MEMORY) if few else None
-        return ArchiveState(domain, seed, spanned, half_widths(domain), archive, 0, torch.cat(first), seen=seen)
+        first = [domain.begin[None], domain.sample(policies.seeded(seed, 0), self.population - 1)]
+        box = policies.box_coordinates(domain)
+        few = box.count == domain.dim <= policies.MOST_OWN
+        seen = policies.Observed(box, torch.empty(0, box.count), memory=MEMORY) if few else None
+        return ArchiveState(
+            domain, seed, spanned, policies.half_widths(domain), archive, 0, torch.cat(first), seen=seen
+        )
 
     def propose(self, state: ArchiveState, n: int) -> tuple[tuple[Proposal, ...], ArchiveState]:
         return tuple(Proposal(u) for u in state.points[len(state.values) :][:n]), state
 
-    def update(self, state: ArchiveState, evaluated: Evaluated) -> ArchiveState:
+    def update(self, state: ArchiveState, evaluated: policies.Evaluated) -> ArchiveState:
         values = (*state.values, *(evaluation.objective for _, evaluation in evaluated))
         wrong = (*state.wrong, *(evaluation.success for _, evaluation in evaluated))
         seen = None if state.seen is None else state.seen.extended(evaluated)
         state = replace(state, values=values, wrong=wrong, seen=seen)
         return state if len(values) < len(state.points) else self._next(state.kept())
 
-    def failures(self, state: ArchiveState) -> Failures:
+    def failures(self, state: ArchiveState) -> policies.Failures:
         """Return the cells whose configuration is a success; those of a generation that is not whole yet count."""
         archive, over = state.kept().archive, tuple(state.spanned.tolist())
         kept = archive.data()
         wrong = np.flatnonzero(kept["wrong"])
         at, objectives = archive.int_to_grid_index(kept["index"][wrong]), kept["objective"][wrong].tolist()
-        around, discrete = wraps(state.domain)[state.spanned], state.domain.options[state.spanned] > 0
+        around, discrete = policies.wraps(state.domain)[state.spanned], state.domain.options[state.spanned] > 0
         listed = []
-        for number in most_different(torch.from_numpy(at / archive.dims), objectives, around, discrete):
+        for number in policies.most_different(torch.from_numpy(at / archive.dims), objectives, around, discrete):
             ends = zip(over, archive.boundaries, at[number], strict=True)
             ranges = {place: (float(edges[k]), float(edges[k + 1])) for place, edges, k in ends}
             u = torch.from_numpy(kept["solution"][wrong[number]].copy())
-            listed.append(FoundFailure(u, objectives[number], ranges))
-        return Failures(tuple(listed), over, len(wrong), len(kept["objective"]), int(archive.cells))
+            listed.append(policies.FoundFailure(u, objectives[number], ranges))
+        return policies.Failures(tuple(listed), over, len(wrong), len(kept["objective"]), int(archive.cells))
 
     def _next(self, state: ArchiveState) -> ArchiveState:
         """Draw a generation; the archive belongs to nobody else yet."""
         state = replace(state, generation=state.generation + 1, values=(), wrong=())
-        rng = seeded(state.seed, state.generation)
+        rng = policies.seeded(state.seed, state.generation)
         if state.archive.empty:
             return replace(state, points=state.domain.sample(rng, self.population))
         anew = int((torch.rand(self.population, generator=rng) < ANEW).sum())
@@ -203,7 +200,7 @@ class MapElites(Policy[ArchiveState]):
         if seen is None:
             children = [state.domain.project(u) for u in state.bred(samples[anew:], rng)]
             return replace(state, points=torch.stack([*samples[:anew], *children]))
-        with one_thread():
+        with policies.one_thread():
             surrogate, seen = seen.surrogate()
             box, moved = seen.space, int(ELSEWHERE * CANDIDATES)
             drawn = box.low + box.width * torch.rand(CANDIDATES, box.count, generator=rng)

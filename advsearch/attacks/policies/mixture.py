@@ -9,10 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.attacks.candidates import Failures, FoundFailure, failure_share, most_different
-from advsearch.attacks.domain import Domain, centre_of_option, wraps
-from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
-from advsearch.errors import InputError
+from advsearch.extend import Domain, InputError, Policy, Proposal, policies
 
 MOST = 50  # more numbers are refused: there would never be enough draws to learn from
 WINDOW = 1000
@@ -181,17 +178,20 @@ class Mixture(Policy[MixtureState]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> MixtureState:
         if domain.dim > MOST:
             raise InputError(f"policy 'mixture': expected at most {MOST} numbers, got {domain.dim}; use pgd or auto")
-        ranges, nothing = Ranges(domain.options, wraps(domain)), torch.empty(0, domain.dim, dtype=torch.float64)
+        ranges, nothing = (
+            Ranges(domain.options, policies.wraps(domain)),
+            torch.empty(0, domain.dim, dtype=torch.float64),
+        )
         log = torch.empty(0, 5, dtype=torch.float64)
-        state = MixtureState(domain, draw_seed(generator), ranges, 0, (), nothing, nothing, log)
+        state = MixtureState(domain, policies.draw_seed(generator), ranges, 0, (), nothing, nothing, log)
         return self._drawn(state, None)
 
     def propose(self, state: MixtureState, n: int) -> tuple[tuple[Proposal, ...], MixtureState]:
         return tuple(Proposal(state.configuration(x)) for x in state.points[state.told :][:n]), state
 
-    def update(self, state: MixtureState, evaluated: Evaluated) -> MixtureState:
+    def update(self, state: MixtureState, evaluated: policies.Evaluated) -> MixtureState:
         points, current = state.points[state.told :][: len(evaluated)], state.learnt[-1]
-        with one_thread():
+        with policies.one_thread():
             weights = (1.0 / self._density(current, points, state.ranges)).tolist()
         bound = 1.0 if current is None else 1.0 / self.even
         rows = [
@@ -202,7 +202,7 @@ class Mixture(Policy[MixtureState]):
         state = replace(state, log=log, seen=torch.cat([state.seen, points]), told=state.told + len(evaluated))
         return state if state.told < self.population else self._drawn(state, self._fitted(state))
 
-    def failures(self, state: MixtureState) -> Failures:
+    def failures(self, state: MixtureState) -> policies.Failures:
         """Return a failure for each component that has some, and the share of all that fail."""
         log, current = state.log[-len(state.seen) :], state.learnt[-1]
         failed = log[:, 1].bool() & ~log[:, 2].bool()
@@ -215,19 +215,19 @@ class Mixture(Policy[MixtureState]):
             members = (nearest == k).nonzero().flatten()
             worst = int(members[objectives[members].argmax()])
             ranges = {} if current is None else state.telling(current, k)
-            listed.append(FoundFailure(state.configuration(points[worst]), float(objectives[worst]), ranges))
+            listed.append(policies.FoundFailure(state.configuration(points[worst]), float(objectives[worst]), ranges))
         whole = all(block.norm != "l2" for block in state.domain.blocks)
-        with one_thread():
-            share = failure_share(state.log[:, 3], state.log[:, 4], state.log[:, 1] > 0, state.log[:, 2] > 0)
+        with policies.one_thread():
+            share = policies.failure_share(state.log[:, 3], state.log[:, 4], state.log[:, 1] > 0, state.log[:, 2] > 0)
         found = int((state.log[:, 1] * (1.0 - state.log[:, 2])).sum())
-        return Failures(tuple(listed), (), found, len(state.log), None, share if whole else None)
+        return policies.Failures(tuple(listed), (), found, len(state.log), None, share if whole else None)
 
     def _drawn(self, state: MixtureState, mixture: Components | None) -> MixtureState:
         """Begin the next generation: its draws come from the mixture, and some of them are even."""
         number = state.generation + 1
-        rng, counts = seeded(state.seed, number), state.ranges.counts
+        rng, counts = policies.seeded(state.seed, number), state.ranges.counts
         points = torch.rand(self.population, len(counts), generator=rng, dtype=torch.float64)
-        points = torch.where(counts > 0, centre_of_option(points, counts.clamp(min=1)), points)
+        points = torch.where(counts > 0, policies.centre_of_option(points, counts.clamp(min=1)), points)
         for row in range(self.population):
             if mixture is not None and float(torch.rand(1, generator=rng)) >= self.even:
                 points[row] = mixture.draw(rng, state.ranges)
@@ -252,11 +252,11 @@ class Mixture(Policy[MixtureState]):
         x, objectives = state.seen[failed], log[failed, 0]
         if not len(x):
             return None
-        with one_thread():
+        with policies.one_thread():
             density = torch.stack([self._density(mixture, x, ranges) for mixture in state.learnt]).mean(dim=0)
             weights = 1.0 / density
             weights *= weights.sum() / weights.square().sum()  # they add up to what they are worth
-            picked = most_different(x, objectives.tolist(), ranges.around, ranges.counts > 0, self.components)
+            picked = policies.most_different(x, objectives.tolist(), ranges.around, ranges.counts > 0, self.components)
             means = x[picked]
             options = torch.ones(len(means), len(ranges.counts), max(1, int(ranges.counts.max())), dtype=torch.float64)
             options *= torch.arange(options.shape[2]) < ranges.counts.clamp(min=1)[:, None]

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.cli.output import at_work
+from advsearch.extend import Exported, Exporter, Progress
 from advsearch.options import rounded
-from advsearch.runs.exporters import Exported, Exporter
 from advsearch.trust.writing import placed_by, replacing
 
 USUAL_SIZE = 100.0  # longest side of a printed object whose size is not known, in millimetres
@@ -23,21 +22,20 @@ class Sheets(Exporter):
     suffix = "pdf"
     options = ("size", "sheets", "paper", "icc")
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any]) -> Exported:
-        with at_work(as_json=True, quiet=False):
-            from advsearch.api.chart import chart_page  # draws with matplotlib
-            from advsearch.api.export import printable, real_size  # takes seconds
-            from advsearch.report.sheets import MOST_SHEETS, write_sheets  # draws with matplotlib
+    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+        from advsearch.api.chart import chart_page  # draws with matplotlib
+        from advsearch.api.export import printable, real_size  # takes seconds
+        from advsearch.report.sheets import MOST_SHEETS, write_sheets  # draws with matplotlib
 
-            known_size = real_size(run) if options["size"] is None else options["size"]
-            longest = USUAL_SIZE if known_size is None else known_size
-            pieces = printable(run, longest)
-            profile = None if options["icc"] is None else Path(options["icc"])
-            title = f"{Path(run).name}, object of {rounded(longest)} mm"
-            paper = (options["paper"] or "a4").lower()
-            most = MOST_SHEETS if options["sheets"] is None else options["sheets"]
-            with placed_by("out"), replacing(out) as part:
-                pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most, last=chart_page)
+        known_size = real_size(run) if options["size"] is None else options["size"]
+        longest = USUAL_SIZE if known_size is None else known_size
+        pieces = printable(run, longest)
+        profile = None if options["icc"] is None else Path(options["icc"])
+        title = f"{Path(run).name}, object of {rounded(longest)} mm"
+        paper = (options["paper"] or "a4").lower()
+        most = MOST_SHEETS if options["sheets"] is None else options["sheets"]
+        with placed_by("out"), replacing(out) as part:
+            pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most, last=chart_page)
         sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
         text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
         if known_size is None:

@@ -1,16 +1,66 @@
-"""A sweep for the dashboard of 3DB."""
+"""A sweep as a folder of 3DB (Leclerc et al. 2021), for its dashboard.
+
+`details.log` has a JSON object a line, `class_maps.json` the names of classes, and ``images/<id>_rgb.png`` the images.
+`advsearch.runs.export.read_threedb` reads such a folder.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.runs.directory import find_run
-from advsearch.runs.export import write_threedb
-from advsearch.runs.exporters import Exported, Exporter
-from advsearch.runs.store import NAME, Store
-from advsearch.viewer.thumbnails import kept_pictures
+from advsearch.extend import Exported, Exporter, InputError, Progress, Store, find_run, thumbnails, writing
+
+DETAILS, CLASSES, IMAGES = "details.log", "class_maps.json", "images"
+PLACED = ("environment", "object")  # values that have a place of their own in a line
+
+
+def write_threedb(rows: Callable[[], Iterable[Any]], out: Path, picture: Callable[[int], bytes | None]) -> int:
+    """Write the rows of a sweep as such a folder, made or empty, with the PNG of each, where one was kept, and return
+    how many there were. ``loss`` is the margin with its sign turned: over 0 where a prediction is not right. The
+    parameter ``network`` tells what several networks predict apart."""
+    writing.check_free_folder(out, "out")
+    names, classes = dict[str, None](), dict[str, int | None]()
+    for row in rows():
+        names |= dict.fromkeys(name for name in row.values if name not in PLACED)
+        classes.setdefault(row.label or Store.NOT_A_NUMBER, row.label_index)
+    if not classes:
+        raise InputError("format 3db: needs the rows of a sweep, and this run has none")
+    numbers = {name: number for name, number in classes.items() if number is not None}
+    for name in [one for one in classes if one not in numbers]:  # behind the others
+        numbers[name] = max(numbers.values(), default=-1) + 1
+    called = {number: name for name, number in numbers.items()}
+    with writing.placed_by("out"):
+        count = 0
+        with writing.replacing(out / DETAILS) as part, part.open("w", encoding="utf-8") as file:
+            for row in rows():
+                line = make_line(row, names, numbers[row.label or Store.NOT_A_NUMBER])
+                file.write(json.dumps(line, allow_nan=False) + "\n")
+                data = picture(row.step)
+                if data is not None:
+                    writing.write_bytes(out / IMAGES / f"{line['id']}_rgb.png", data, durable=False)
+                count += 1
+        listed = [called.get(number, f"class {number}") for number in range(max(called) + 1)]
+        writing.write_text(out / CLASSES, json.dumps(listed))
+    return count
+
+
+def make_line(row: Any, names: Iterable[str], prediction: int) -> dict[str, Any]:
+    said = {name: one["value"] for name, one in row.values.items()}
+    parameters = {"network" if name == "model" else name: said.get(name, "none") for name in names}
+    environment, model = (str(said.get(name, "none")) for name in PLACED)
+    return {
+        "id": f"{row.step}",
+        "environment": environment,
+        "model": model,
+        "is_correct": str(bool(row.correct)),
+        "loss": None if row.margin is None else 0.0 - row.margin,
+        "prediction": [prediction],
+        "output_type": "classes",
+        "render_args": parameters,
+    }
 
 
 class ThreeDB(Exporter):
@@ -21,10 +71,10 @@ class ThreeDB(Exporter):
     example = "export mug-sweep-001 --format 3db --out folder"
     options = ("kind",)
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any]) -> Exported:
+    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
         directory = find_run(run)
-        kept = kept_pictures(directory)
-        with Store(directory / NAME, read_only=True) as store:
+        kept = thumbnails.kept_pictures(directory)
+        with Store(directory / Store.FILE, read_only=True) as store:
             picture = kept.png_of if kept else lambda _: None
             count = write_threedb(lambda: store.rows(options["kind"] or "sweep"), out, picture)
         return Exported({"rows": count}, f"{count} rows in {out}; look at them with: python -m threedboard {out}")

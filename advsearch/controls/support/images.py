@@ -1,8 +1,9 @@
-"""Images that controls scale, save and read."""
+"""Images that controls scale, warp, save and read, (H, W, C) tensors; and meshes as the texels of an image."""
 
 from __future__ import annotations
 
 import io
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -10,8 +11,12 @@ import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
-from advsearch.controls.corruption_filters import picture, planes, resized
+from advsearch import seeds
 from advsearch.scene.color import levels_of, linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import to_8_bit as to_8_bit
+from advsearch.scene.raster import MeshSurface as MeshSurface
+from advsearch.scene.raster import pixels_in as pixels_in
+from advsearch.scene.raster import rasterised as rasterised
 
 PRINT_SIDE = 512  # least side of the picture that is kept for printing, in pixels
 
@@ -43,3 +48,39 @@ def coded(image: Tensor, quality: int) -> Tensor:
     with Image.open(file, formats=("JPEG",)) as read:
         read_back = torch.from_numpy(np.asarray(read, dtype=np.float32) / 255.0)
     return image + (read_back.to(image.device) - image).detach()
+
+
+def planes(image: Tensor) -> Tensor:
+    """(H, W, C) to (1, C, H, W)."""
+    return image.permute(2, 0, 1)[None]
+
+
+def picture(stack: Tensor) -> Tensor:
+    """(1, C, H, W) to (H, W, C)."""
+    return stack[0].permute(1, 2, 0)
+
+
+def warped(image: Tensor, shift: Tensor) -> Tensor:
+    """Look every pixel of an image (H, W, C) up at another place: `shift` (H, W, 2) pixels to the right and down;
+    places outside are mirrored inwards."""
+    height, width = image.shape[:2]
+    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    where = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(image.device)
+    grid = where * torch.tensor([2.0 / width, 2.0 / height], device=image.device) - 1.0
+    return picture(F.grid_sample(planes(image), grid[None], padding_mode="reflection", align_corners=False))
+
+
+def resized(field: Tensor, height: int, width: int, *, antialias: bool = True) -> Tensor:
+    """Resize an (h, w, C) field to (height, width, C), bilinearly; differentiable."""
+    if field.shape[:2] == (height, width):
+        return field
+    size = (height, width)
+    stack = F.interpolate(planes(field), size, mode="bilinear", antialias=antialias, align_corners=False)
+    return picture(stack).contiguous()
+
+
+@lru_cache(maxsize=8)
+def drawn(height: int, width: int, seed: int, stream: str, *, normal: bool = True) -> Tensor:
+    """Return the noise (height, width, 3) of a stream of random numbers: standard normal, or uniform in [0, 1)."""
+    source = torch.Generator().manual_seed(seeds.stream(seed, stream))
+    return (torch.randn if normal else torch.rand)(height, width, 3, generator=source)

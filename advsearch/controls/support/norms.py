@@ -9,7 +9,9 @@ DEFAULT_EPSILON = 0.1
 NORMS = ("linf", "l2")
 
 
-def radius(norm: str, epsilon: float | None, count: int) -> float:
-    """Return the radius of a ball over `count` colours, `DEFAULT_EPSILON` where none is given: in an L2 ball so large
-    that its edge has the same root-mean-square."""
-    return DEFAULT_EPSILON * (math.sqrt(count) if norm == "l2" else 1.0) if epsilon is None else float(epsilon)
+def radius(norm: str, epsilon: float | None, count: int, default: float = DEFAULT_EPSILON) -> float:
+    """Return the radius of a ball over `count` colors, the default where none is given: in an L2 ball so large that
+    its edge has the same root-mean-square."""
+    if epsilon is not None:
+        return float(epsilon)
+    return default * (math.sqrt(count) if norm == "l2" else 1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,17 +11,23 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, Control, Value, changed
+from advsearch.controls.base import LARGEST_EPSILON, NOTHING, WHOLE_RANGE, Budget, Control, Value, changed
 from advsearch.controls.ranges import Fixed, Range, Spec
+from advsearch.controls.support.norms import DEFAULT_EPSILON, radius
 from advsearch.errors import FileFormatError
 from advsearch.scene.importing.pictures import read_picture
 from advsearch.scene.settings import Parameter
 
 
 class PictureControl(Control):
-    """A control of a picture, searched or from a file, and of numbers, which are fixed where they are not given."""
+    """A control of a picture, searched or from a file, and of numbers, which are fixed where they are not given.
 
+    Its choices are `resolution`, `picture`, `norm` ("box" for any color, "linf" or "l2") and `epsilon`.
+    """
+
+    LARGEST_EPSILON: ClassVar[float] = LARGEST_EPSILON
     shown: ClassVar[str]  # the parameter that is the picture
+    default_epsilon: ClassVar[float] = DEFAULT_EPSILON  # of colors, where none is chosen
     _picture: Tensor | None
 
     @property
@@ -39,6 +46,16 @@ class PictureControl(Control):
     def spec(self, parameter: Parameter) -> Spec:
         picture = Range(0.0, 1.0) if self.free else Fixed(0.0)
         return self.specs.get(parameter.name, picture if parameter.name == self.shown else Fixed(parameter.default))
+
+    def budget_of(self, parameter: Parameter) -> Budget:
+        norm = self.chosen["norm"]
+        if parameter.name != self.shown or norm == "box":
+            return WHOLE_RANGE
+        spec = self.spec(parameter)
+        assert isinstance(spec, Range)
+        n_colors = 3 * math.prod(self.sides)
+        reach = radius(norm, self.chosen["epsilon"], n_colors, self.default_epsilon)
+        return Budget(norm, reach / (spec.high - spec.low))
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
         values, picture = super().values(u), self._picture

@@ -19,17 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from advsearch.errors import InputError, ModelError
-from advsearch.models.model import warn
-from advsearch.models.source import Source, source_of
+from advsearch.extend import InputError, ModelError, models
 from advsearch.models.zoo.library import Loaded, Processing, measured, nearly
 from advsearch.models.zoo.zero_shot import spoken
-from advsearch.trust.foreign_code import foreign
-
-QUESTION = "What is this? Answer with its name only."  # what is asked where nothing else is said
-
-SIDE = 448
-"""Side in pixels of pictures for networks that take any size: a multiple of 28 and of 32, the cells of Qwen's."""
 
 LEVELS = 0.05
 """What values of pixels may be off from the processor's for 8-bit pictures, as a share of the largest: it rounds."""
@@ -45,7 +37,7 @@ def speaks(architecture: str, network: Any) -> bool:
     return architecture in names.values()
 
 
-def source(loaded: Loaded) -> Source:
+def source(loaded: Loaded) -> models.Source:
     """Return the source of a classifier of the names that are given, or of free answers. Raises ModelError where the
     network has an encoder for texts of its own, its processor can't be had, or it goes on otherwise than is read
     here."""
@@ -68,8 +60,8 @@ def source(loaded: Loaded) -> Source:
             f"{'none' if names is None else repr(names[0])}; with `task=answer` it answers freely"
         )
     kind = type(loaded.network).__name__
-    with foreign(f"model {loaded.spec}: is a {kind}, which can't be asked about a picture as LLaVA can"):
-        reader = _Speaker(loaded, processor, question or QUESTION)
+    with models.foreign(f"model {loaded.spec}: is a {kind}, which can't be asked about a picture as LLaVA can"):
+        reader = _Speaker(loaded, processor, question or models.QUESTION)
         tokens = reader.tokens_of(names or (CHECKED,))
         most = getattr(loaded.network.config.get_text_config(), "max_position_embeddings", None)
         length = reader.prompt(reader.side)["input_ids"].shape[1]
@@ -91,17 +83,17 @@ def source(loaded: Loaded) -> Source:
     weights = list(loaded.network.parameters())
     if (count := sum(tensor.numel() for tensor in weights)) >= LARGE:
         size = sum(tensor.nbytes for tensor in weights)
-        warn(
+        models.warn(
             f"model {name} has {count / 1e9:.3g} billion weights, {size / 1e9:.3g} GB, and took {seconds:.2g} s "
             "to answer one picture here; a gradient takes longer"
         )
-    return source_of(module, name, labels=names, batch_limits=(1, 1), reads_text=True, **reader.described)
+    return models.source_of(module, name, labels=names, batch_limits=(1, 1), reads_text=True, **reader.described)
 
 
 def _say_what_begins_another(tokens: Sequence[Sequence[int]], names: Sequence[str], name: str) -> None:
     for (first, short), (second, long) in permutations(enumerate(tokens), 2):
         if list(long[: len(short)]) == list(short):
-            warn(
+            models.warn(
                 f"model {name} reads {names[first]!r} (#{first}) as the beginning of {names[second]!r} "
                 f"(#{second}): whoever says the second has said the first"
             )
@@ -128,7 +120,7 @@ class _Speaker(nn.Module):
             content = [{"type": "image"}, {"type": "text", "text": question}]
             turns = [{"role": "user", "content": content}]
             self.text = processor.apply_chat_template(turns, add_generation_prompt=True)
-        side = getattr(getattr(loaded.network.config, "vision_config", None), "image_size", None) or SIDE
+        side = getattr(getattr(loaded.network.config, "vision_config", None), "image_size", None) or models.SIDE
         self.side = (int(side[0]), int(side[1])) if isinstance(side, (list, tuple)) else (int(side), int(side))
         self.described = Processing()
         with suppress(ModelError):  # it is called then

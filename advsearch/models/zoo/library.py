@@ -7,7 +7,6 @@ say. One that no size, mean and standard deviation stand for is called, inside t
 from __future__ import annotations
 
 import contextlib
-import importlib
 import logging
 import re
 import warnings
@@ -21,29 +20,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from advsearch.errors import CodeNotAllowedError, ModelError
-from advsearch.models.model import Triple, warn
-from advsearch.models.source import Purpose, Source, source_of
-from advsearch.trust.archives import without_unpickling
-from advsearch.trust.code import how_to_allow, may_fetch
-from advsearch.trust.foreign_code import first_line
-from advsearch.trust.network import connecting
-
-
-def library(name: str, spec: str, extra: str) -> Any:
-    """Return an optional library, that an extra of advsearch installs and a model needs. Raises ModelError where it is
-    not installed, or cannot be imported."""
-    try:
-        return importlib.import_module(name)
-    except Exception as error:  # a build for another torch raises RuntimeError, among others
-        command = f"pip install 'advsearch[{extra}]'"
-        if isinstance(error, ModuleNotFoundError) and error.name == name:
-            raise ModelError(f"model {spec}: needs {name}, which is not installed: {command}") from error
-        raise ModelError(
-            f"model {spec}: needs {name}, which cannot be imported here ({first_line(error)}). Install builds that fit "
-            f"each other: {command}, torch's own index where that has them; or export the network with torch.export "
-            f"where {name} works, and give the .pt2 file"
-        ) from error
+from advsearch.extend import ModelError, models
 
 
 @contextlib.contextmanager
@@ -54,20 +31,20 @@ def reading(spec: str, advice: str) -> Iterator[None]:
     logging.disable(logging.WARNING)  # of single tries to connect: an error is raised in the end
     tries: list[object] = []
     try:
-        with without_unpickling(), warnings.catch_warnings(), connecting(may_fetch(spec), tries):
+        with models.without_unpickling(), warnings.catch_warnings(), models.connecting(models.may_fetch(spec), tries):
             warnings.simplefilter("ignore")
             yield
     except ModelError:
         raise
     except Exception as error:  # a library raises nearly anything for what is not there or damaged
         if tries:
-            raise CodeNotAllowedError(
+            raise models.CodeNotAllowedError(
                 f"a file names the model {spec}, which is not on this machine and would be fetched; "
-                f"{how_to_allow(spec)}"
+                f"{models.how_to_allow(spec)}"
             ) from error
         raise ModelError(
-            f"model {spec}: cannot be fetched or read ({first_line(error)}). Weights come from the library's cache on "
-            f"this machine, else from where it publishes them; they are never unpickled. {advice}"
+            f"model {spec}: cannot be fetched or read ({models.first_line(error)}). Weights come from the library's "
+            f"cache on this machine, else from where it publishes them; they are never unpickled. {advice}"
         ) from error
     finally:
         logging.disable(disabled)
@@ -85,8 +62,8 @@ class Processing(TypedDict, total=False):
     """Fields of `advsearch.models.source.Source`."""
 
     input_size: tuple[int, int]
-    mean: Triple
-    std: Triple
+    mean: models.Triple
+    std: models.Triple
     channels: str
     processor: Callable[[Tensor], Tensor]
 
@@ -168,14 +145,16 @@ def _called(processor: Any, spec: str, size: Processing, what: str) -> Processin
     except Exception as error:  # a processor that works with numpy raises nearly anything
         pil = getattr(processor, "backend", None) == "pil"
         advice = "; with torchvision installed, transformers takes one that may" if pil else ""
-        raise _other(spec, processor, f"{what}, and lets no gradient through ({first_line(error)}){advice}") from error
+        raise _other(
+            spec, processor, f"{what}, and lets no gradient through ({models.first_line(error)}){advice}"
+        ) from error
     off = np.abs(seen.detach().double().numpy() - expected).max() if seen.shape == (1, *expected.shape) else np.inf
     if not reaches or not off <= TOLERANCE * np.ptp(expected):
         raise _other(spec, processor, f"{what}, and rounds or does otherwise where a gradient goes through it")
     return Processing(processor=call, **size)
 
 
-def _triple(numbers: Array) -> Triple:
+def _triple(numbers: Array) -> models.Triple:
     """Round to what eight digits hold: a processor computes in float32."""
     red, green, blue = (float(f"{number:.7g}") + 0.0 for number in numbers)
     return red, green, blue
@@ -211,13 +190,13 @@ class Loaded:
     spec: str  # what its user wrote, for messages
     processor: Any  # of images; None where it has none
     part: Callable[[str], Any]  # loads another part by the class that does it, such as "AutoTokenizer"
-    purpose: Purpose
+    purpose: models.Purpose
 
     @cached_property
     def described(self) -> Processing:
         """What is done to pictures. Raises ModelError as `measured`; warns where there is no image processor."""
         if self.processor is None:
-            warn(
+            models.warn(
                 f"model {self.spec} comes without an image processor: pictures are given as they are, RGB in [0, 1]. "
                 "Say `mean`, `std` and `input_size` of load_model if it wants them otherwise"
             )
@@ -237,15 +216,15 @@ class Loaded:
         sides = (side, side) if isinstance(side, int) else tuple(side or ())
         return Processing(**{**({"input_size": sides} if sides else {}), **self.described})
 
-    def source(self, ask: Ask, *, boxes: bool = False, **fields: Any) -> Source:
+    def source(self, ask: Ask, *, boxes: bool = False, **fields: Any) -> models.Source:
         """Return the source of the network as `Adapted` asks it, given pictures as it wants them; `fields` go to
         `Source`."""
-        return source_of(Adapted(self.network, ask, boxes=boxes), self.name, **{**self.described, **fields})
+        return models.source_of(Adapted(self.network, ask, boxes=boxes), self.name, **{**self.described, **fields})
 
-    def with_texts(self, module: nn.Module, names: tuple[str, ...], dtype: torch.dtype) -> Source:
+    def with_texts(self, module: nn.Module, names: tuple[str, ...], dtype: torch.dtype) -> models.Source:
         """Return the source of a module made of the network and texts for names."""
         described = self.sized(getattr(self.network.config, "vision_config", None))
-        return source_of(module, self.name, labels=names, dtype=dtype, reads_text=True, **described)
+        return models.source_of(module, self.name, labels=names, dtype=dtype, reads_text=True, **described)
 
 
 def nearly(own: Tensor, ours: Tensor, size: float, dtype: torch.dtype) -> bool:

@@ -18,15 +18,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from advsearch.errors import InputError, ModelError, UnknownNameError
-from advsearch.models.model import PRESETS, SMALLEST_PROBABILITY, warn
-from advsearch.models.source import Purpose, Source, load_weights, near_names, source_of, split_weights
+from advsearch.extend import InputError, ModelError, UnknownNameError, models
 from advsearch.models.zoo import zero_shot
-from advsearch.models.zoo.library import Adapted, Loaded, library, reading
+from advsearch.models.zoo.library import Adapted, Loaded, reading
 
 TASK = "similarity"  # the task that compares features
 ENDINGS = ("Model", "ModelWithProjection")
-PARTS = ("image_embeds", "pooler_output", "last_hidden_state")  # of outputs that hold the features, the best first
 TOKENS = ("cls_token", "class_embedding", "class_token")  # weights of a first token that stands for the whole picture
 
 
@@ -48,7 +45,7 @@ def no_classes(name: str, what: str) -> ModelError:
     )
 
 
-def source(loaded: Loaded, plain: Callable[[Loaded], Source] | None = None) -> Source:
+def source(loaded: Loaded, plain: Callable[[Loaded], models.Source] | None = None) -> models.Source:
     """Return the source of a network that has features: of these where they are compared, else `plain`'s, if it has
     anything else."""
     network = loaded.network
@@ -70,23 +67,10 @@ def source(loaded: Loaded, plain: Callable[[Loaded], Source] | None = None) -> S
 
     def features(network: Any, images: Tensor) -> Any:
         returned = (network.get_image_features if zero_shot.compares(network) else network)(pixel_values=images)
-        found = pooled(returned, token=token)
+        found = models.pooled(returned, token=token)
         return returned if found is None else found
 
     return replace(loaded, network=part).source(features, **loaded.sized(config))
-
-
-def pooled(returned: Any, *, token: bool) -> Tensor | None:
-    """Return the features (N, D) in an output of a network, a tensor (N, D) or what has one of `PARTS`; None where
-    there are none. Maps (N, D, H, W) are averaged over their positions. Of several tokens (N, T, D), the first stands
-    for the picture if `token`, otherwise their mean."""
-    for part in PARTS:
-        value = returned.get(part) if isinstance(returned, Mapping) else getattr(returned, part, None)
-        if isinstance(value, Tensor):
-            if value.dim() == 3:
-                return value[:, 0] if token else value.mean(dim=1)
-            return value.flatten(2).mean(dim=2) if value.dim() == 4 else value
-    return returned if isinstance(returned, Tensor) else None
 
 
 DISPARITY, METRIC = "relative disparity", "metric depth"
@@ -96,7 +80,7 @@ BY_FAMILY = {"dpt": DISPARITY, "depth_pro": DISPARITY, "zoedepth": METRIC, "glpn
 """Of a network whose ``config`` does not say it, by family: that of the weights that are published first."""
 
 
-def depth_source(loaded: Loaded) -> Source:
+def depth_source(loaded: Loaded) -> models.Source:
     """Return the source of a network that returns how far each pixel is: a mapping with numbers (N, h, w) under what
     they are."""
     config = loaded.network.config
@@ -126,7 +110,7 @@ FINE = (384, 384)  # height and width to which transformers brings the masks of 
 SENTENCE = "the task is semantic"  # what OneFormer is told to do
 
 
-def mask_source(loaded: Loaded) -> Source:
+def mask_source(loaded: Loaded) -> models.Source:
     """Return the source of a network that returns masks and their classes: of logarithms of scores (N, classes, H, W)
     of each pixel of the input. Warns what these are (ModelWarning).
 
@@ -134,7 +118,7 @@ def mask_source(loaded: Loaded) -> Source:
     pixel is in that one's mask (Cheng et al. 2021, arXiv 2107.06278, section 3.4, "semantic inference"). Sizes are
     changed where `post_process_semantic_segmentation` of each family changes them.
     """
-    warn(
+    models.warn(
         f"model {loaded.name} gives a pixel a score of each class, summed over its masks, which is no logit: its "
         "logarithm is used, so that margins are logarithms of a ratio of scores"
     )
@@ -156,7 +140,7 @@ def mask_source(loaded: Loaded) -> Source:
             masks = functional.interpolate(masks, size=size, mode="bilinear")
         scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
         scores = functional.interpolate(scores, size=size, mode="bilinear")
-        return scores.float().clamp_min(SMALLEST_PROBABILITY).log()
+        return scores.float().clamp_min(models.SMALLEST_PROBABILITY).log()
 
     return loaded.source(ask, labels=loaded.names or None)
 
@@ -165,25 +149,25 @@ def mask_source(loaded: Loaded) -> Source:
 # ``timm:NAME`` and ``torchvision:NAME``: networks that classify, segment or find objects, and features of timm's.
 
 
-def load_timm(spec: str, purpose: Purpose) -> Source:
+def load_timm(spec: str, purpose: models.Purpose) -> models.Source:
     """Return ``timm:NAME[@weights.safetensors]``, with timm's pretrained weights where none are given. Size,
     normalisation and labels are those of its pretrained weights. Raises ModelError: timm is missing, its weights cannot
     be had, or those that were given do not fit; UnknownNameError: timm has no network of that name."""
-    name, weights = split_weights(spec.partition(":")[2])
-    timm = library("timm", spec, "timm")
+    name, weights = models.split_weights(spec.partition(":")[2])
+    timm = models.library("timm", spec, "timm")
     if not timm.is_model(name.partition(".")[0]):
-        raise UnknownNameError("timm network", name, near_names(name, timm.list_models()))
+        raise UnknownNameError("timm network", name, models.near_names(name, timm.list_models()))
     with reading(spec, f"Give 'timm:{name}@weights.safetensors'"):
         module = timm.create_model(name, pretrained=weights is None)
     if weights is not None:
-        load_weights(module, weights, name)
+        models.load_weights(module, weights, name)
     return _source(timm, module, name, purpose)
 
 
-def timm_repository(spec: str, name: str, revision: str, purpose: Purpose) -> Source:
+def timm_repository(spec: str, name: str, revision: str, purpose: models.Purpose) -> models.Source:
     """Return the network of a repository, or of a folder, that timm has made; `spec` is for messages. Raises ModelError
     where timm is missing, or it cannot be had."""
-    timm = library("timm", spec, "timm")
+    timm = models.library("timm", spec, "timm")
     local = Path(name).is_dir()
     place = f"local-dir:{name}" if local else f"hf-hub:{name}{'@' if revision else ''}{revision}"
     with reading(spec, "Give a folder with config.json and model.safetensors, as timm saves them"):
@@ -191,7 +175,7 @@ def timm_repository(spec: str, name: str, revision: str, purpose: Purpose) -> So
     return _source(timm, module, name.rstrip("/").rpartition("/")[2], purpose)
 
 
-def of_timm(network: nn.Module, purpose: Purpose) -> Source | None:
+def of_timm(network: nn.Module, purpose: models.Purpose) -> models.Source | None:
     """Return the source of a network of timm that is there already; None of any other."""
     timm: Any = sys.modules.get("timm")
     if timm is None or not isinstance(getattr(network, "pretrained_cfg", None), dict):
@@ -199,10 +183,10 @@ def of_timm(network: nn.Module, purpose: Purpose) -> Source | None:
     return _source(timm, network, type(network).__name__, purpose)
 
 
-def wrapped_timm(loaded: Loaded) -> Source:
+def wrapped_timm(loaded: Loaded) -> models.Source:
     """Return the source of a network of timm inside a `TimmWrapperForImageClassification` of transformers, whose
     ``config`` may tell more than timm. There are no labels where transformers only numbers them."""
-    timm = library("timm", loaded.spec, "timm")
+    timm = models.library("timm", loaded.spec, "timm")
     network: Any = loaded.network
     described = getattr(network.config, "pretrained_cfg", None)
     return _source(timm, network.timm_model, loaded.name, loaded.purpose, described, loaded.names)
@@ -212,10 +196,10 @@ def _source(
     timm: Any,
     module: Any,
     name: str,
-    purpose: Purpose,
+    purpose: models.Purpose,
     described: Mapping[str, Any] | None = None,
     labels: tuple[str, ...] = (),
-) -> Source:
+) -> models.Source:
     """Return the source of a network of timm, which is asked for its classes or for its features. `described` stands
     for its ``pretrained_cfg``; labels go before timm's."""
     compared, classes = purpose.task == TASK, module.num_classes
@@ -231,7 +215,7 @@ def _source(
     def what_the_head_reads(network: Any, images: Tensor) -> Any:
         return network.forward_head(network.forward_features(images), pre_logits=True)
 
-    return source_of(
+    return models.source_of(
         Adapted(module, what_the_head_reads) if compared and classes else module,
         name,
         input_size=tuple(map(int, config["input_size"][1:])),
@@ -245,41 +229,39 @@ MOST_DETECTED = 4
 """Most pictures that a detector is given at once: at 800 x 800 each takes a gigabyte or two with its derivative."""
 
 
-def load_torchvision(spec: str) -> Source:
+def load_torchvision(spec: str) -> models.Source:
     """Return ``torchvision:NAME[@weights.safetensors]``, with torchvision's default weights where none are given. Size,
     normalisation and labels are those of the default weights, where torchvision tells them. Its detectors normalise by
     themselves, and resize too: their size is the one that they would resize a square picture to. Raises ModelError:
     torchvision is missing or broken, its weights cannot be had, those that were given do not fit, or it is quantised or
     for videos; UnknownNameError: torchvision has no such network."""
-    name, weights = split_weights(spec.partition(":")[2])
-    models = library("torchvision", spec, "torchvision").models
-    classifies, segments, finds = (
-        models.list_models(module=m) for m in (models, models.segmentation, models.detection)
-    )
+    name, weights = models.split_weights(spec.partition(":")[2])
+    zoo = models.library("torchvision", spec, "torchvision").models
+    classifies, segments, finds = (zoo.list_models(module=m) for m in (zoo, zoo.segmentation, zoo.detection))
     if name not in (*classifies, *segments, *finds):
         for part, what in NOT_FOR_PICTURES.items():
-            if name in (models.list_models(module=getattr(models, part)) if hasattr(models, part) else ()):
+            if name in (zoo.list_models(module=getattr(zoo, part)) if hasattr(zoo, part) else ()):
                 plain = f"torchvision:{name.removeprefix('quantized_')}"
                 raise ModelError(f"model {spec}: {what.format(plain=plain)}")
-        raise UnknownNameError("torchvision network", name, near_names(name, (*classifies, *segments, *finds)))
-    default = getattr(models.get_model_weights(name), "DEFAULT", None)
+        raise UnknownNameError("torchvision network", name, models.near_names(name, (*classifies, *segments, *finds)))
+    default = getattr(zoo.get_model_weights(name), "DEFAULT", None)
     parts = {} if name in classifies else {"weights_backbone": None}
     with reading(spec, f"Give 'torchvision:{name}@weights.safetensors'"):
-        module: nn.Module = models.get_model(name, weights=None if weights else default, **parts)
+        module: nn.Module = zoo.get_model(name, weights=None if weights else default, **parts)
     if weights is not None:
-        load_weights(module, weights, name)
+        models.load_weights(module, weights, name)
     if name in classifies:
-        return source_of(module, name, **_defaults(default, module))
+        return models.source_of(module, name, **_defaults(default, module))
     fields = _defaults(default, None)
     if name in segments:
-        return source_of(Adapted(module, _scores_by_pixel), name, **fields)
+        return models.source_of(Adapted(module, _scores_by_pixel), name, **fields)
     fields |= {"mean": None, "std": None, "batch_limits": (1, MOST_DETECTED)}
     inside = getattr(module, "transform", None)  # which would resize a square picture
     if fixed := getattr(inside, "fixed_size", None):
         fields["input_size"] = int(fixed[1]), int(fixed[0])
     elif shortest := getattr(inside, "min_size", None):
         fields["input_size"] = (int(shortest if isinstance(shortest, int) else shortest[-1]),) * 2
-    return source_of(Adapted(module, _found, boxes=True), name, **fields)
+    return models.source_of(Adapted(module, _found, boxes=True), name, **fields)
 
 
 NOT_FOR_PICTURES = {
@@ -302,7 +284,7 @@ def _scores_by_pixel(network: Any, images: Tensor) -> Any:
 
 def _defaults(default: Any | None, classifier: nn.Module | None) -> dict[str, Any]:
     """Return what default weights tell of a source; the labels of a classifier only if they fit it."""
-    mean, std = PRESETS["imagenet"]
+    mean, std = models.PRESETS["imagenet"]
     fields: dict[str, Any] = {"input_size": (224, 224), "mean": mean, "std": std}
     if default is None:
         return fields

@@ -16,12 +16,9 @@ from typing import Any, NamedTuple
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from advsearch.errors import ModelError, resembling
-from advsearch.models.all_at_once import AllAtOnce
-from advsearch.models.source import Purpose, Source, source_of
+from advsearch.extend import ModelError, models
 from advsearch.models.zoo import language, outputs, zero_shot
-from advsearch.models.zoo.library import Adapted, Ask, Loaded, cached_file, in_pixels, library, processor_of, reading
-from advsearch.trust.foreign_code import first_line
+from advsearch.models.zoo.library import Adapted, Ask, Loaded, cached_file, in_pixels, processor_of, reading
 
 
 class Family(NamedTuple):
@@ -32,7 +29,7 @@ class Family(NamedTuple):
 
     ours: str | Callable[[str, Any], bool]
     loader: str | None
-    source: Callable[[Loaded], Source]
+    source: Callable[[Loaded], models.Source]
 
 
 PATIENCE = 5.0
@@ -41,7 +38,7 @@ PATIENCE = 5.0
 ADVICE = "Give a folder that save_pretrained(..., safe_serialization=True) has made as 'hf:FOLDER'"
 
 
-def load(spec: str, purpose: Purpose) -> Source:
+def load(spec: str, purpose: models.Purpose) -> models.Source:
     """Return ``hf:REPOSITORY[@REVISION]`` or ``hf:FOLDER``: a network of one of `NETWORKS`.
 
     One that reads texts gets its classes from its user (`zero_shot`, `language`). Labels of others are those that they
@@ -52,7 +49,7 @@ def load(spec: str, purpose: Purpose) -> Source:
     its processor does what `Preprocessing` can't.
     """
     name, _, revision = spec.partition(":")[2].strip().partition("@")
-    transformers = library("transformers", spec, "hf")
+    transformers = models.library("transformers", spec, "hf")
     if Path(name).is_dir():
         name = str(Path(name).resolve())
     elif Path(name).is_file():
@@ -82,7 +79,7 @@ def load(spec: str, purpose: Purpose) -> Source:
     return kind.source(Loaded(network, name.rstrip("/").rpartition("/")[2], spec, processor, part, purpose))
 
 
-def of_network(network: nn.Module, purpose: Purpose) -> Source | None:
+def of_network(network: nn.Module, purpose: models.Purpose) -> models.Source | None:
     """Return the source of a network of transformers that is there already; None of any other. Names come from its
     ``config``, and what is done to pictures from the repository or folder that it was loaded from; a ModelWarning says
     where that has no image processor, or can't be read any more."""
@@ -137,8 +134,8 @@ def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -
         cached = [folder.name.partition("--")[2].replace("--", "/") for folder in cache.glob("models--*")]
         raise ModelError(
             f"model {spec}: {name} is no folder here{_near_folders(name)}, and no repository of that name is in the "
-            f"cache{_meant(resembling(name, cached))} or can be had ({first_line(error)}). Check the name and the "
-            "network, or give a folder"
+            f"cache{_meant(models.resembling(name, cached))} or can be had ({models.first_line(error)}). Check the "
+            "name and the network, or give a folder"
         ) from error
 
 
@@ -155,7 +152,7 @@ def _out_of_reach(name: str) -> bool:
 def _near_folders(name: str) -> str:
     place = Path(name).expanduser()
     there = [folder.name for folder in place.parent.iterdir() if folder.is_dir()] if place.parent.is_dir() else []
-    return _meant([str(place.parent / near) for near in resembling(place.name, there)])
+    return _meant([str(place.parent / near) for near in models.resembling(place.name, there)])
 
 
 def _meant(names: Sequence[str]) -> str:
@@ -198,7 +195,7 @@ def _boxes(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
     return boxes, returned.logits.sigmoid()
 
 
-def _with_names(ask: Ask, *, boxes: bool = False) -> Callable[[Loaded], Source]:
+def _with_names(ask: Ask, *, boxes: bool = False) -> Callable[[Loaded], models.Source]:
     """Return what makes the source of a network whose ``config`` has the names of its classes."""
     return lambda loaded: loaded.source(ask, boxes=boxes, labels=loaded.names or None)
 
@@ -216,12 +213,12 @@ class _OfFrames:
         return getattr(self.processor, name)
 
 
-def _of_clips(loaded: Loaded) -> Source:
+def _of_clips(loaded: Loaded) -> models.Source:
     """The source of a network that takes (N, T, 3, H, W): T frames are the pictures of a rig."""
     config = loaded.network.config
     loaded = replace(loaded, processor=loaded.processor and _OfFrames(loaded.processor))
-    module = AllAtOnce(Adapted(loaded.network, _logits), int(config.num_frames))
-    return source_of(module, loaded.name, labels=loaded.names or None, **loaded.sized(config))
+    module = models.AllAtOnce(Adapted(loaded.network, _logits), int(config.num_frames))
+    return models.source_of(module, loaded.name, labels=loaded.names or None, **loaded.sized(config))
 
 
 NETWORKS = (

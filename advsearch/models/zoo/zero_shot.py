@@ -13,12 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from advsearch.errors import InputError, ModelError
-from advsearch.models.labels import patterns
-from advsearch.models.model import sharing_copy, warn
-from advsearch.models.source import Source
+from advsearch.extend import InputError, ModelError, models
 from advsearch.models.zoo.library import Adapted, Ask, Loaded, in_pixels, nearly
-from advsearch.trust.foreign_code import foreign
 
 TEXTS = 64  # texts that are embedded at once
 
@@ -28,18 +24,18 @@ def compares(network: Any) -> bool:
     return all(hasattr(network, f"get_{half}_features") for half in ("image", "text"))
 
 
-def source(loaded: Loaded) -> Source:
+def source(loaded: Loaded) -> models.Source:
     """Return the source of a classifier of the names that are given. Raises ModelError where the network takes patches
     in place of pictures, or its scores are other than are worked out here."""
     check_takes_pictures(loaded.network, loaded.spec)
     name, names = loaded.name, loaded.purpose.named(loaded.name, "compares a picture with texts", "classification")
-    prompts = patterns(loaded.purpose.prompts)
+    prompts = models.patterns(loaded.purpose.prompts)
     if len(names) < 2:
         raise InputError(f"labels: expected two names at least, of which model {name} chooses one, got {names[0]!r}")
     tokenizer, words, alone = loaded.part("AutoTokenizer"), spoken(names), hasattr(loaded.network, "logit_bias")
     texts = [prompts[0].replace("{}", word) for word in words]
-    with foreign(f"model {name}: cannot embed the names of `labels`"), torch.no_grad():
-        network: Any = sharing_copy(loaded.network).eval()
+    with models.foreign(f"model {name}: cannot embed the names of `labels`"), torch.no_grad():
+        network: Any = models.sharing_copy(loaded.network).eval()
         scale = network.temperature.reciprocal() if hasattr(network, "temperature") else network.logit_scale.exp()
         rows = averaged(network, tokenizer, words, prompts)
         head = nn.Linear(rows.shape[1], len(names))
@@ -50,7 +46,7 @@ def source(loaded: Loaded) -> Source:
         _check(network, compared, tokenizer, texts[0], made)
     say_what_is_one(tokenizer, texts, names, name)
     if alone:
-        warn(
+        models.warn(
             f"model {name} judges each name by itself, with a sigmoid of its logit: the scores that are shown are a "
             f"softmax over the {len(names)} names, and margins are differences of logits"
         )
@@ -106,7 +102,7 @@ class _Compared(nn.Module):
 
     def __init__(self, network: nn.Module, head: nn.Linear) -> None:
         super().__init__()
-        self.network: Any = sharing_copy(network)
+        self.network: Any = models.sharing_copy(network)
         for part in [part for part, _ in self.network.named_children() if part.startswith("text")]:
             setattr(self.network, part, None)
         self.head = head
@@ -119,7 +115,7 @@ class _Compared(nn.Module):
         return scores
 
 
-def _check(network: Any, compared: _Compared, tokenizer: Any, text: str, made: Source) -> None:
+def _check(network: Any, compared: _Compared, tokenizer: Any, text: str, made: models.Source) -> None:
     """Raise a ModelError where the network itself gives a picture of noise and a text another score."""
     shape = (1, 3, *(made.input_size or (224, 224)))
     noise = torch.rand(shape, generator=torch.Generator().manual_seed(0)).to(network.device, network.dtype)
@@ -140,7 +136,7 @@ def say_what_is_one(tokenizer: Any, texts: Sequence[str], names: Sequence[str], 
     for number, tokens in enumerate(tokenizer(list(texts), verbose=False)["input_ids"]):
         first = seen.setdefault(tuple(tokens), number)
         if first != number:
-            warn(
+            models.warn(
                 f"model {name} reads {names[first]!r} (#{first}) and {names[number]!r} (#{number}) as the same text: "
                 "it cannot tell one from the other"
             )
@@ -152,12 +148,12 @@ Build = Callable[[Loaded, Any, Any, Sequence[str]], Ask]
 boxes (N, K, 4) in pixels, x0 y0 x1 y1, and scores (N, K, names) in [0, 1] of each name by itself."""
 
 
-def detector(loaded: Loaded) -> Source:
+def detector(loaded: Loaded) -> models.Source:
     """Return the source of a detector of the names that are given, of a network of one of `DETECTORS`."""
     names = loaded.purpose.named(loaded.name, "finds what it is told to", "detection")
     tokenizer, words = loaded.part("AutoTokenizer"), spoken(names)
-    with foreign(f"model {loaded.name}: cannot read the names of `labels`"), torch.no_grad():
-        network: Any = sharing_copy(loaded.network).eval()
+    with models.foreign(f"model {loaded.name}: cannot read the names of `labels`"), torch.no_grad():
+        network: Any = models.sharing_copy(loaded.network).eval()
         ask = DETECTORS[type(network).__name__](loaded, network, tokenizer, words)
     say_what_is_one(tokenizer, words, names, loaded.name)
     return loaded.with_texts(Adapted(network, ask, boxes=True), names, network.dtype)
@@ -168,7 +164,7 @@ def _owl(loaded: Loaded, network: Any, tokenizer: Any, words: Sequence[str]) -> 
     2205.06230, section 3). The texts of a name are averaged as CLIP's are. The half of OWL for texts is left out
     then."""
     half = getattr(network, network.base_model_prefix)
-    rows = averaged(half, tokenizer, words, patterns(loaded.purpose.prompts)).to(network.dtype)
+    rows = averaged(half, tokenizer, words, models.patterns(loaded.purpose.prompts)).to(network.dtype)
     half.text_model = half.text_projection = None
 
     def ask(network: Any, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -183,7 +179,7 @@ def _owl(loaded: Loaded, network: Any, tokenizer: Any, words: Sequence[str]) -> 
 def _grounded(loaded: Loaded, network: Any, tokenizer: Any, words: Sequence[str]) -> Ask:
     """All names are one text, ``mug. cup. bowl.`` as its processor writes it, and a box has a score of each of its
     tokens (Liu et al. 2023, arXiv 2303.05499, section 3). A name's is the largest of its own."""
-    name, (prompt, *others) = loaded.name, patterns(loaded.purpose.prompts or ("{}",))
+    name, (prompt, *others) = loaded.name, models.patterns(loaded.purpose.prompts or ("{}",))
     if others:
         raise InputError(
             f"prompt: model {name} reads all names in one text, in which several prompts can't be averaged; give one, "

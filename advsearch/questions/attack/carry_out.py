@@ -35,8 +35,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.transport import CleanMatrix, refusal_of_matrices
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
-from advsearch.models import Model
-from advsearch.models.address import AskedModel
+from advsearch.models import Model, RemoteNetwork
 from advsearch.options import as_setting, told
 from advsearch.progress import NullProgress, Progress, Stages, Watched, watcher
 from advsearch.questions.attack import settings as numbers
@@ -104,7 +103,7 @@ def carry_out(job: AttackParts, progress: Progress, resumed: str | Path | None =
                     f"{count(problem.draws, 'condition')}; `steps` and `draws` change that."
                 )
             findings = Attack(journal, job.config, policy, stages, clean=job.clean).carry_out()
-        if isinstance(problem.model.module, AskedModel):
+        if isinstance(problem.model.module, RemoteNetwork):
             warnings.append(problem.model.module.sentence)
         named = job.objective if isinstance(job.objective, str) else job.config.objective
         result = summarise(job.config, named, findings, journal, stages, warnings)
@@ -122,7 +121,7 @@ def _policy(job: AttackParts, problem: Problem) -> Policy[Any]:
     """Where a model lets no gradient through, `auto` climbs by differences; behind an address it climbs nowhere."""
     config, norms = job.config, {block.norm for block in problem.domain.blocks}
     policy = make_policy(job.policy, **config.policy_options) if isinstance(job.policy, str) else job.policy
-    if isinstance(problem.model.module, AskedModel):
+    if isinstance(problem.model.module, RemoteNetwork):
         if policy.name == "auto":
             policy = WithoutAscent() if norms == {"box"} else make_policy("nes")
         elif policy.uses_gradient:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult
-from advsearch.controls.base import WAY
+from advsearch.controls.base import Control
 from advsearch.controls.ranges import OneOf
 from advsearch.engine.judging import task_for
 from advsearch.engine.loading import Scene, load_scene
@@ -341,7 +341,7 @@ def along_drive(problem: Problem, u: Tensor | None, spp: int, run: RunDirectory 
     if path is None:
         return None
     start = problem.whole(problem.domain.start)
-    specs = [slot.spec for slot in path.slots if slot.parameter.name == WAY]
+    specs = [slot.spec for slot in path.slots if slot.parameter.name == Control.WAY]
     drawn = next((spec.values for spec in specs if isinstance(spec, OneOf)), ())
     ways = list(dict.fromkeys(drawn))  # which one is drawn is the coordinate behind the time
     each = start.repeat(max(1, len(ways)), FRAMES, 1)

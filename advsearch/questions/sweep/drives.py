@@ -14,7 +14,6 @@ import numpy.typing as npt
 import torch
 
 from advsearch.controls import Control
-from advsearch.controls.base import WAY
 from advsearch.engine.naming import given_to
 from advsearch.options import OUT_OF_VIEW
 from advsearch.questions.attack.result import evenly, write_drive
@@ -46,9 +45,9 @@ def with_frames(config: SweepConfig, drawn: tuple[Control, ...]) -> tuple[tuple[
     name, seconds = f"{travelling.name}.time", travelling.seconds
     frames = f"0:{seconds:g}:{max(2, round(seconds * config.fps) + 1)}"
     grid = config.grid if name in config.grid else {**config.grid, name: frames}
-    which = f"{travelling.name}.{WAY}"
-    ways = next((one.options for one in travelling.own if one.name == WAY), ())
-    if ways and config.samples is None and which not in grid and WAY not in travelling.specs:
+    which = f"{travelling.name}.{Control.WAY}"
+    ways = next((one.options for one in travelling.own if one.name == Control.WAY), ())
+    if ways and config.samples is None and which not in grid and Control.WAY not in travelling.specs:
         grid = {which: list(ways), **grid}  # nothing is drawn: each of them is looked at
     return drawn, grid
 
@@ -96,7 +95,7 @@ class Drives:
             for model, task in enumerate(job.tasks)
             if isinstance(task, Detection)
         }
-        which, distance = f"{axis.instance}.{WAY}", f"{axis.instance}.distance"
+        which, distance = f"{axis.instance}.{Control.WAY}", f"{axis.instance}.distance"
         self._unit = "object sizes"
         for row in rows:
             picture, model = divmod(row.step, len(job.models))

@@ -11,10 +11,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import damaged, last_line, looks_like, read_bytes
-from advsearch.trust.programs import find_blender, run_converter, surroundings
-from advsearch.trust.stored_files import LARGEST_FILE, scaled
+from advsearch.extend import FileFormatError, reading, stored_files
 
 LONGEST = 120  # seconds that Blender may take, before `scaled`
 BEGINNINGS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
@@ -43,18 +40,20 @@ def convert_blend(path: Path, data: bytes) -> bytes:
     """Return a Blender file as binary glTF. Raises FileFormatError: it is none, there is no Blender, it can't read the
     file, or it takes too long."""
     if not data.startswith(BEGINNINGS):
-        raise damaged(path, "a Blender scene", looks_like(data))
-    program = find_blender(f"{path}: Blender has to read it", "export glTF (.glb) from Blender and name that")
+        raise reading.damaged(path, "a Blender scene", reading.looks_like(data))
+    program = reading.find_blender(f"{path}: Blender has to read it", "export glTF (.glb) from Blender and name that")
     with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
         script, target = Path(folder) / "export.py", Path(folder) / "scene.glb"
         script.write_text(EXPORT, "utf-8")
-        names = [str(path.resolve()), str(target), str(scaled(LARGEST_FILE))]
+        names = [str(path.resolve()), str(target), str(stored_files.scaled(stored_files.LARGEST_FILE))]
         started = [*program, str(script), *([] if "-I" in program else ["--"]), *names]
         try:
-            done = run_converter(path, "Blender", started, folder=folder, seconds=LONGEST, env=surroundings(folder))
+            done = reading.run_converter(
+                path, "Blender", started, folder=folder, seconds=LONGEST, env=reading.surroundings(folder)
+            )
         except OSError as error:
             raise FileFormatError(f"{path}: Blender can't be started ({error.strerror}); check {program[0]}") from error
         if done.returncode or not target.is_file():
-            last = last_line(done.stdout + done.stderr)
+            last = reading.last_line(done.stdout + done.stderr)
             raise FileFormatError(f"{path}: Blender could not read it{last}; export glTF (.glb) from it yourself")
-        return read_bytes(target, "object", (".glb",))
+        return reading.read_bytes(target, "object", (".glb",))

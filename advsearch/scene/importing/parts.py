@@ -145,12 +145,11 @@ class ImportedPart:
 
     vertices: Doubles  # (V, 3) positions in the file's axes and units; may hold NaN
     faces: Ints  # (F, 3) vertices, F > 0
-    normals: Doubles | None  # (V, 3) of the file, not necessarily unit length or finite
-    uvs: Doubles | None  # (V, 2), v = 0 at the bottom row
-    colors: (
-        Doubles | None
-    )  # (F, 3, 3) colour of each corner in [0, 1], which multiplies the base colour in linear light
-    surface: ImportedSurface
+    normals: Doubles | None = None  # (V, 3) of the file, not necessarily unit length or finite
+    uvs: Doubles | None = None  # (V, 2), v = 0 at the bottom row
+    # (F, 3, 3) colour of each corner in [0, 1], which multiplies the base colour in linear light
+    colors: Doubles | None = None
+    surface: ImportedSurface = ImportedSurface()
     node: int = -1  # number of its node in a glTF file; -1 in others
     flat: bool = False  # where the file gives no normals, its faces are flat; otherwise smooth normals are made
     movable: Movable | None = None  # where something moves, the part as it is stored, its vertices in this order

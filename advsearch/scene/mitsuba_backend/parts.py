@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import singledispatch
 from operator import attrgetter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -344,19 +342,3 @@ def scene_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
         # (h, w, 3): of a ground that shows the environment's photograph (`advsearch.scene.grounds`)
         SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", interior=True),
     )
-
-
-def sunsky_tables() -> tuple[Tensor, Tensor, Tensor]:
-    """Read the RGB coefficients of Hosek and Wilkie's sky and sun that Mitsuba ships for its `sunsky` plugin.
-
-    Returns:
-        (10 turbidities, 2 ground albedos, 6 control points, 3 channels, 9) shape of the dome; (10, 2, 6, 3) its mean
-        radiance; and (10, 45 pieces, 3 channels, 4 powers of the elevation, 6 powers of the cosine at the limb)
-        radiance of the sun. All float32.
-    """
-    path = Path(str(mi.__file__)).parent / "data" / "sunsky" / "sunsky_datasets.bin"
-    with contextlib.redirect_stdout(io.StringIO()):  # the reader prints what it loads
-        tables = mi.tensor_io.read(str(path))
-    names = ("sky_params_rgb", "sky_rad_rgb", "sun_rad_rgb")
-    shape, level, sun = (torch.from_numpy(tables[name]).float() for name in names)
-    return shape, level, sun

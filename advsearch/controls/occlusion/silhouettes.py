@@ -14,11 +14,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import NDArray
 
-from advsearch.scene.assets import Bools, Doubles
-from advsearch.scene.geometry import NEAREST
-from advsearch.scene.raster import pixels_in
+from advsearch.extend import geometry, images, parts
 
 RASTER = 128  # pixels along the longer side of a silhouette
 SCAN = 48  # angles at which the coverage is looked up before the crossing is narrowed down
@@ -26,43 +24,14 @@ HALVINGS = 12  # steps that narrow it down
 GRID = 24  # rows and columns of the directions that stand for the whole frame
 
 
-@dataclass(frozen=True)
-class Frame:
-    """What the picture shows, as tangents: the ranges to the right and upwards."""
-
-    left: float
-    right: float
-    low: float
-    high: float
-
-    @staticmethod
-    def of(fov: float, aspect: float = 1.0, shift: tuple[float, float] = (0.0, 0.0)) -> Frame:
-        """Return the frame of a camera with a field of view along the larger side, degrees, an aspect of width over
-        height, and a shift of the picture to the right in its widths and downwards in its heights: what it shows moves
-        the other way."""
-        larger = math.tan(math.radians(fov) / 2.0)
-        x, y = larger * min(1.0, aspect), larger * min(1.0, 1.0 / aspect)
-        right, down = 2.0 * x * shift[0], 2.0 * y * shift[1]
-        return Frame(-x + right, x + right, -y - down, y - down)
-
-    def spread(self) -> Doubles:
-        """Unit directions (N, 3) that stand for the whole of it."""
-        return Silhouette(np.ones((GRID, GRID), dtype=np.bool_), self).directions()
-
-    def corners(self) -> Doubles:
-        """Unit directions (4, 3) to the corners."""
-        tangents = [(x, y, 1.0) for x in (self.left, self.right) for y in (self.low, self.high)]
-        return _unit(np.array(tangents))
-
-
 @dataclass(frozen=True, eq=False)
 class Silhouette:
     """Which directions a thing is seen in: a mask (h, w) over a window of tangents, row 0 at its low end."""
 
-    mask: Bools
-    window: Frame
+    mask: NDArray[np.bool_]
+    window: geometry.Frame
 
-    def directions(self) -> Doubles:
+    def directions(self) -> parts.Doubles:
         """Unit directions (N, 3), one in each covered pixel; all stand for the same area of the picture. Their places
         within pixels are a low-discrepancy sequence (Roberts 2018), or an upright edge would hide whole columns."""
         row, column = np.nonzero(self.mask)
@@ -72,22 +41,24 @@ class Silhouette:
         y = window.low + (row + (0.5 + 0.5698403 * number) % 1.0) * (window.high - window.low) / height
         return _unit(np.stack([x, y, np.ones_like(x)], axis=-1))
 
-    def contains(self, x: Doubles, y: Doubles, forwards: Doubles) -> Bools:
+    def contains(self, x: parts.Doubles, y: parts.Doubles, forwards: parts.Doubles) -> NDArray[np.bool_]:
         """Whether directions, any shape and length, lie in the silhouette."""
         height, width = self.mask.shape
-        depth = np.maximum(forwards, NEAREST)
+        depth = np.maximum(forwards, geometry.NEAREST)
         column = np.floor((x / depth - self.window.left) / (self.window.right - self.window.left) * width)
         row = np.floor((y / depth - self.window.low) / (self.window.high - self.window.low) * height)
-        inside = (forwards > NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        inside = (forwards > geometry.NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         row, column = (np.where(inside, at, 0).astype(np.int64) for at in (row, column))
         return np.asarray(inside & self.mask[row, column])
 
 
-def silhouette(points: Doubles, faces: npt.NDArray[np.uint32], frame: Frame | None = None) -> Silhouette | None:
+def silhouette(
+    points: parts.Doubles, faces: NDArray[np.uint32], frame: geometry.Frame | None = None
+) -> Silhouette | None:
     """Rasterise a mesh with vertices (V, 3) in camera coordinates as the camera sees it within a frame, None for all in
     front; faces (F, 3) that reach behind the camera are left out. None if nothing is seen of it."""
     corners = points[faces.astype(np.int64)]
-    corners = corners[(corners[..., 2] > NEAREST).all(axis=1)]
+    corners = corners[(corners[..., 2] > geometry.NEAREST).all(axis=1)]
     if len(corners) == 0:
         return None
     tangents = corners[..., :2] / corners[..., 2:]
@@ -100,22 +71,22 @@ def silhouette(points: Doubles, faces: npt.NDArray[np.uint32], frame: Frame | No
     pixel = max(right - left, high - low) / RASTER
     width, height = (max(1, math.ceil((b - a) / pixel)) for a, b in ((left, right), (low, high)))
     scaled = (tangents - (left, low)) * (width / (right - left), height / (high - low)) - 0.5
-    _, row, column, _ = pixels_in(scaled, (height, width))
+    _, row, column, _ = images.pixels_in(scaled, (height, width))
     mask = np.zeros((height, width), dtype=np.bool_)
     mask[row, column] = True
-    return Silhouette(mask, Frame(float(left), float(right), float(low), float(high))) if mask.any() else None
+    return Silhouette(mask, geometry.Frame(float(left), float(right), float(low), float(high))) if mask.any() else None
 
 
 @dataclass(frozen=True, eq=False)
 class Passage:
     """A thing that moves sideways past another, both as the camera sees them."""
 
-    hidden: Doubles  # directions (N, 3) in which what is to be hidden is seen
+    hidden: parts.Doubles  # directions (N, 3) in which what is to be hidden is seen
     cover: Silhouette  # of the moving thing, straight ahead of the camera
-    axes: Doubles  # (3, 3) rows: where its right, up and forward point when it is in the middle of the other
+    axes: parts.Doubles  # (3, 3) rows: where its right, up and forward point when it is in the middle of the other
     direction: float  # from which side it comes: degrees, 0 from the right of the picture, 90 from above
 
-    def coverage(self, angles: Doubles) -> Doubles:
+    def coverage(self, angles: parts.Doubles) -> parts.Doubles:
         """Return the hidden share (K,) at angles (K,) in radians away from the middle."""
         turn = math.radians(self.direction)
         right, up, forward = (self.hidden @ self.axes.T).T
@@ -150,7 +121,12 @@ class Passage:
         return 0.5 * (out + within)
 
 
-def middle_axes(hidden: Doubles) -> Doubles:
+def spread_directions(frame: geometry.Frame) -> parts.Doubles:
+    """Return unit directions (N, 3) that stand for all that a frame shows."""
+    return Silhouette(np.ones((GRID, GRID), dtype=np.bool_), frame).directions()
+
+
+def middle_axes(hidden: parts.Doubles) -> parts.Doubles:
     """Return a camera's axes (3, 3) turned to look at the middle of a silhouette: rows right, up, forward."""
     forward = hidden.mean(axis=0)
     forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
@@ -159,7 +135,9 @@ def middle_axes(hidden: Doubles) -> Doubles:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def angle_outside(shown: Doubles, rim: Doubles, cover: Silhouette, axes: Doubles, direction: float) -> float:
+def angle_outside(
+    shown: parts.Doubles, rim: parts.Doubles, cover: Silhouette, axes: parts.Doubles, direction: float
+) -> float:
     """Return the angle in radians beyond which a thing that comes from a direction, degrees, is out of the picture on
     its side: of directions (N, 3) spread over the whole picture and (M, 3) at its edge; the others as of `Passage`."""
     radius = float(np.arccos(np.clip(cover.window.corners()[:, 2], -1.0, 1.0)).max())
@@ -170,5 +148,5 @@ def angle_outside(shown: Doubles, rim: Doubles, cover: Silhouette, axes: Doubles
     return float(angles[max(int(inside[0]) - 1, 0)]) if len(inside) else float(angles[0])
 
 
-def _unit(vectors: Doubles) -> Doubles:
+def _unit(vectors: parts.Doubles) -> parts.Doubles:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

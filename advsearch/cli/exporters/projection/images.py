@@ -5,21 +5,13 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from advsearch import seeds
-from advsearch.api.export import adversarial_of
-from advsearch.controls.projector import ProjectorControl
-from advsearch.controls.space import file_name
-from advsearch.controls.support.images import enlarged
-from advsearch.errors import InputError
-from advsearch.runs.files import write_png
-from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.color import linear_to_srgb
-from advsearch.trust.writing import placed_by, storage_errors, write_text
+from advsearch.extend import AdversarialRun, Control, Exporter, InputError, color, images, seeds, writing
 
 ROWS = 1024  # least height of the pictures to project, in pixels
 SHARES = (1 / 8, 1 / 2, 7 / 8)  # where the nine marks are in a picture, of its width and height
@@ -29,35 +21,31 @@ SPP = 64  # samples a pixel of the picture of the scene with the marks
 def write_projection(run: str | Path, out: Path) -> list[str]:
     """Write a folder for each projector of a run's adversarial scene: `picture.png` to project, `texels.png` with the
     exact values, `marks.png` to project first, `seen.png`, where the run's camera sees these marks, and `README.txt`;
-    return sentences about what to set. Raises errors as `adversarial_of`, and InputError where it has no projector, or
-    the folder is there already."""
+    return sentences about what to set. Raises errors as `AdversarialRun.load`, and InputError where it has no
+    projector, or the folder is there already."""
     if os.path.lexists(out):
         raise InputError(f"out: {out} is there already; choose another name")
-    adversarial = adversarial_of(run)
+    adversarial = AdversarialRun.load(run)
     slices = adversarial.problem.space.slices(adversarial.u)
-    projectors = [(one, part) for one, part in slices if isinstance(one, ProjectorControl)]
+    projectors: list[tuple[Any, Tensor]] = [(control, part) for control, part in slices if has_pattern(control)]
     if not projectors:
         raise InputError(f"{adversarial.folder}: it has no projector, so that there is nothing to project")
     notes: list[str] = []
-    with placed_by("out"), storage_errors(out):
+    with writing.placed_by("out"), writing.storage_errors(out):
         for control, part in projectors:
-            folder = out / file_name(control.name) if len(projectors) > 1 else out
+            folder = out / control.file_name if len(projectors) > 1 else out
             folder.mkdir(parents=True)
             values = control.values(part)
             pattern = values["pattern"]
             factor = -(-ROWS // len(pattern))
             marks, places = marked((len(pattern), pattern.shape[1]), factor)
             small = torch.nn.functional.avg_pool2d(marks.permute(2, 0, 1)[None], factor)[0].permute(1, 2, 0)
-            write_png(folder / "picture.png", enlarged(pattern, factor))
-            write_png(folder / "texels.png", pattern)
-            write_png(folder / "marks.png", linear_to_srgb(marks))
-            renderer, inputs = adversarial.problem.renderer, adversarial.inputs
-            inputs |= control.scene_inputs({**values, "pattern": linear_to_srgb(small)}, {})
-            traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+            Exporter.write_png(folder / "picture.png", images.enlarged(pattern, factor))
+            Exporter.write_png(folder / "texels.png", pattern)
+            Exporter.write_png(folder / "marks.png", color.linear_to_srgb(marks))
+            lit = control.scene_inputs({**values, "pattern": color.linear_to_srgb(small)}, {})
             seed = seeds.stream(adversarial.problem.seed, "marks")
-            with torch.no_grad():
-                rendered = renderer.rendered(traced, seed, SPP, "backdrop.color" in inputs)
-                write_png(folder / "seen.png", renderer.finished(rendered, inputs, adversarial.u))
+            Exporter.write_png(folder / "seen.png", adversarial.render({**adversarial.inputs, **lit}, seed, SPP))
             number = {name: float(value) for name, value in values.items() if value.ndim == 0}
             unit = "m" if control.scene.object.metres is not None else "object sizes"
             fov, aspect, white = control.part.fov, control.part.aspect, control.measured(values, {})["white"]["value"]
@@ -76,9 +64,14 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
                 at = f"{mark}: row {row}, column {column}"
                 where.append(f"{at}; {right:.2f} degrees to the right of the middle, {up:.2f} up")
             text = ["Set:", *settings, "", "Marks of marks.png, by texel from the upper left:", *where, ""]
-            write_text(folder / "README.txt", "\n".join(text), durable=False)
+            writing.write_text(folder / "README.txt", "\n".join(text), durable=False)
             notes += settings
     return notes
+
+
+def has_pattern(control: Control) -> bool:
+    """Return whether a control throws an image whose texels are known, as the control projector does."""
+    return control.competes_with_ambient and any(slot.parameter.name == "pattern" for slot in control.slots)
 
 
 def marked(sides: tuple[int, int], factor: int) -> tuple[Tensor, list[tuple[int, int, float, float]]]:

@@ -19,17 +19,10 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
-from advsearch.errors import FileFormatError
-from advsearch.scene.assets import face_vectors
-from advsearch.scene.glb import GlbBuffer
-from advsearch.scene.importing.files import SPLATS, check_faces
-from advsearch.scene.importing.geometry import triangulated
-from advsearch.scene.importing.gltf import DEEPEST_TREE, LARGEST_TREE
-from advsearch.scene.importing.gltf_entries import GENERATOR
+from advsearch.extend import FileFormatError, reading, stored_files
 from advsearch.scene.importing.usd import PACKAGE
-from advsearch.scene.importing.usd_layers import check_layers, unpacked
-from advsearch.scene.importing.usd_surface import FIRST, BoundMaterial, Layout, PrimvarUse, UsdSurfaces
-from advsearch.trust.stored_files import check_most
+from advsearch.scene.importing.usd.layers import check_layers, unpacked
+from advsearch.scene.importing.usd.surface import FIRST, BoundMaterial, Layout, PrimvarUse, UsdSurfaces
 
 MOST_TINTS = 16  # colours and opacities of faces that are materials of their own; of more, colours are of vertices
 PARTICLES = "ParticleField"  # how the types of Gaussian splats and their like begin
@@ -62,12 +55,16 @@ class Conversion:
     source: str
     read: list[str]
     left: Counter[str] = field(default_factory=Counter)
-    buffer: GlbBuffer = field(default_factory=GlbBuffer)
+    buffer: reading.GlbBuffer = field(default_factory=reading.GlbBuffer)
     triangles: int = 0
 
     def __post_init__(self) -> None:
         self.header: dict[str, Any] = {name: [] for name in ("nodes", "meshes", "materials", "textures", "images")}
-        self.header |= {"samplers": [], "cameras": [], "asset": {"version": "2.0", "generator": GENERATOR}}
+        self.header |= {
+            "samplers": [],
+            "cameras": [],
+            "asset": {"version": "2.0", "generator": reading.gltf_entries.GENERATOR},
+        }
         self.lights: list[dict[str, Any]] = []
         self._surfaces = UsdSurfaces(self.folder, self.header, self.buffer, self.left, self.read)
         self._skins = UsdSkel.Cache()
@@ -77,9 +74,9 @@ class Conversion:
 
     def _prims(self) -> Iterator[Any]:
         for number, prim in enumerate(Usd.PrimRange(self.stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())):
-            check_most(self.source, number, LARGEST_TREE, "USD of at most {} prims", "more")
+            stored_files.check_most(self.source, number, reading.LARGEST_TREE, "USD of at most {} prims", "more")
             depth = prim.GetPath().pathElementCount
-            check_most(self.source, depth, DEEPEST_TREE, "prims of at most {} levels", "more")
+            stored_files.check_most(self.source, depth, reading.DEEPEST_TREE, "prims of at most {} levels", "more")
             yield prim
 
     def glb(self) -> bytes:
@@ -131,13 +128,13 @@ class Conversion:
                 del node["children"]
         header["scenes"], header["scene"] = [{"nodes": [0]}], 0
         if has_splats and not header["meshes"]:
-            what = f"expected a mesh with faces, got Gaussian splats, a model that {SPLATS}"
+            what = f"expected a mesh with faces, got Gaussian splats, a model that {reading.SPLATS}"
             raise FileFormatError(f"{self.source}: {what}")
         if self.lights:
             header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
         notes = [what if count == 1 else f"{what} ({count:,} times)" for what, count in self.left.items()]
         if has_splats:
-            notes.insert(0, f"has Gaussian splats, which are left out: a model that {SPLATS}")
+            notes.insert(0, f"has Gaussian splats, which are left out: a model that {reading.SPLATS}")
         header["asset"]["extras"] = {"left_out": notes[:100]}
         return self.buffer.file({key: value for key, value in header.items() if value or key == "asset"})
 
@@ -218,8 +215,8 @@ class Conversion:
         if moved is not None:
             node["moved"] = moved.ravel().tolist()
         self.triangles += int(np.maximum(counts - 2, 0).sum())
-        check_faces(self.source, self.triangles, "more")
-        picked, face, _ = triangulated(points[corners], counts)
+        reading.check_faces(self.source, self.triangles, "more")
+        picked, face, _ = reading.triangulated(points[corners], counts)
         keep = ~np.isin(face, holes)
         picked, face = picked[keep], face[keep]
         if _first(mesh, "Orientation") == UsdGeom.Tokens.leftHanded:
@@ -402,7 +399,7 @@ def _array(values: Any, kind: Any, width: int = 0) -> Array:
 
 def _smooth(points: Array, faces: Array) -> Array:
     """Normals (P, 3) of points: the mean of those of their triangles (T, 3), by area."""
-    across = face_vectors(points[faces])
+    across = reading.face_vectors(points[faces])
     normals = np.zeros_like(points)
     for corner in range(3):
         np.add.at(normals, faces[:, corner], across)

@@ -20,23 +20,15 @@ import numpy.typing as npt
 from PIL import Image
 from pxr import Ar, Usd, UsdShade
 
-from advsearch.errors import FileFormatError
-from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.glb import GlbBuffer, mime_type
-from advsearch.scene.importing.gltf_entries import BORDER, CLAMPED, MIRRORED, REPEAT
-from advsearch.scene.importing.parts import holds_normals
-from advsearch.scene.importing.unread import TrackedKeys, join_names
-from advsearch.scene.importing.usd_layers import read_packaged, shorten
-from advsearch.scene.importing.usd_pictures import (
+from advsearch.extend import FileFormatError, color, reading, stored_files
+from advsearch.scene.importing.usd.layers import read_packaged, shorten
+from advsearch.scene.importing.usd.pictures import (
     EXR,
     decode_picture,
     has_colors_of_8_bits,
     is_marked_srgb,
     is_of_8_bits,
 )
-from advsearch.trust import stored_files
-from advsearch.trust.named_files import MISSING, OUTSIDE, is_inside
-from advsearch.trust.stored_files import LARGEST_FILE
 
 Array = npt.NDArray[Any]
 FIRST = Usd.TimeCode.EarliestTime()
@@ -46,7 +38,13 @@ READERS_OF_COLORS = ("UsdPrimvarReader_float3", "UsdPrimvarReader_float4")
 READER_OF_NUMBERS = "UsdPrimvarReader_float"
 GREY = (0.18, 0.18, 0.18)  # the linear diffuse colour of a preview surface that says none
 ROUGHNESS = 0.5  # the same
-WRAPS = {"repeat": REPEAT, "mirror": MIRRORED, "clamp": CLAMPED, "black": BORDER, "useMetadata": BORDER}
+WRAPS = {
+    "repeat": reading.gltf_entries.REPEAT,
+    "mirror": reading.gltf_entries.MIRRORED,
+    "clamp": reading.gltf_entries.CLAMPED,
+    "black": reading.gltf_entries.BORDER,
+    "useMetadata": reading.gltf_entries.BORDER,
+}
 CHANNELS: Mapping[str, Sequence[int]] = {
     **{"rgb": (0, 1, 2), "rgba": (0, 1, 2), "xyz": (0, 1, 2)},
     **{"r": (0,), "g": (1,), "b": (2,), "a": (3,)},
@@ -102,12 +100,12 @@ class Shader:
     """A shader whose inputs are tracked."""
 
     prim: Any
-    inputs: TrackedKeys[Any]
+    inputs: reading.TrackedKeys[Any]
 
     @classmethod
     def of(cls, prim: Any) -> Shader:
         inputs = {given.GetBaseName(): given for given in prim.GetInputs()}
-        return cls(prim, TrackedKeys(inputs))
+        return cls(prim, reading.TrackedKeys(inputs))
 
     @property
     def kind(self) -> str:
@@ -176,7 +174,7 @@ class UsdSurfaces:
 
     folder: Path
     header: dict[str, Any]
-    buffer: GlbBuffer
+    buffer: reading.GlbBuffer
     left: Counter[str]  # sentences about what is left out
     read: list[str]  # files that were read
     _bound: dict[str, BoundMaterial] = field(default_factory=dict)
@@ -237,7 +235,7 @@ class UsdSurfaces:
         resolved = str(asset.resolvedPath) or str(self.folder / path)
         outer, inner = Ar.SplitPackageRelativePathOuter(resolved)
         outer = os.path.realpath(outer)
-        is_own = is_inside(outer, self.folder)
+        is_own = reading.is_inside(outer, self.folder)
         data = None
         if is_own and os.path.isfile(outer):
             try:
@@ -245,12 +243,12 @@ class UsdSurfaces:
                 data = (
                     read_packaged(packaged)
                     if inner
-                    else stored_files.read_bytes(Path(outer), "a picture", LARGEST_FILE)
+                    else stored_files.read_bytes(Path(outer), "a picture", stored_files.LARGEST_FILE)
                 )
             except KeyError:
                 data = None
         if data is None:
-            why = MISSING if is_own else OUTSIDE
+            why = reading.MISSING if is_own else reading.OUTSIDE
             self.leave(f"the texture {path[:100]!r} of {name} {why}")
             return None
         self.read.append(outer)
@@ -282,7 +280,7 @@ class UsdSurfaces:
         return self.add_texture(file.getvalue(), sampler)
 
     def add_texture(self, data: bytes, sampler: Mapping[str, int]) -> int:
-        image = self._numbered("images", {"mimeType": mime_type(data), "bufferView": self.buffer.view(data)})
+        image = self._numbered("images", {"mimeType": reading.mime_type(data), "bufferView": self.buffer.view(data)})
         return self._numbered("textures", {"source": image, "sampler": self._numbered("samplers", sampler)})
 
     def _numbered(self, kind: str, entry: Mapping[str, Any]) -> int:
@@ -340,7 +338,7 @@ class PreviewSurface:
             self.surfaces.leave(f"has materials with {what[:100]}, which is left out")
         for node in self.nodes.values():
             if unread := node.inputs.unread():
-                self.surfaces.leave(f"has a {node.kind[:50]} with {join_names(unread, 5)}, which is not read")
+                self.surfaces.leave(f"has a {node.kind[:50]} with {reading.join_names(unread, 5)}, which is not read")
 
     # ---- what inputs show --------------------------------------------------------------------------------------------
 
@@ -399,7 +397,7 @@ class PreviewSurface:
             word = str(node.value(axis) or "useMetadata")
             if word not in WRAPS:
                 self.surfaces.leave(f"has a texture with the {axis} {word[:50]!r}, which is taken for repeat")
-            wraps.append(WRAPS.get(word, REPEAT))
+            wraps.append(WRAPS.get(word, reading.gltf_entries.REPEAT))
         return wraps[0], wraps[1]
 
     def _layout(self, node: Shader) -> Layout:
@@ -472,16 +470,16 @@ class PreviewSurface:
             entry.update(masked if threshold > 0.0 else {"alphaMode": "BLEND"})
         return color_primvar, opacity_primvar
 
-    def _baked(self, shown: UsdTextureUse | None, cut: UsdTextureUse | None, color: Sequence[float]) -> Array | None:
+    def _baked(self, shown: UsdTextureUse | None, cut: UsdTextureUse | None, factor: Sequence[float]) -> Array | None:
         """Return display values (H, W, 3 or 4) of colour and opacity; None where neither picture can be read."""
         colors = None if shown is None else self.surfaces.values(shown)
         shares = None if cut is None else self.surfaces.values(cut)
         if colors is None and shares is None:
             return None
         if colors is None and shares is not None:
-            colors = np.broadcast_to(np.array(color, np.float32), (*shares.shape[:2], 3))
+            colors = np.broadcast_to(np.array(factor, np.float32), (*shares.shape[:2], 3))
         assert colors is not None
-        levels = linear_to_srgb(np.broadcast_to(colors, (*colors.shape[:2], 3)).astype(np.float32))
+        levels = color.linear_to_srgb(np.broadcast_to(colors, (*colors.shape[:2], 3)).astype(np.float32))
         if shares is None:
             return levels
         if shares.shape[:2] != levels.shape[:2]:
@@ -547,7 +545,7 @@ class PreviewSurface:
             return
         if use.is_plain and is_of_8_bits(use.data):  # USD asks for both, which many exporters leave out
             texels = self.surfaces.texels(replace(use, is_srgb=False))
-            if texels is not None and holds_normals(texels[:, :, :3]):
+            if texels is not None and reading.holds_normals(texels[:, :, :3]):
                 use = replace(use, scale=NORMAL_SCALE, bias=NORMAL_BIAS, is_srgb=False)
                 self.surfaces.leave(
                     "has a normal map of 8 bits without scale (2, 2, 2, 1) and bias (-1, -1, -1, 0), which are added"
@@ -576,7 +574,7 @@ class PreviewSurface:
                 return
             values = np.broadcast_to(np.maximum(np.nan_to_num(values), 0.0), (*values.shape[:2], 3))
             most = max(float(values.max()), 1e-6)
-            texture = self.surfaces.add_picture(linear_to_srgb((values / most).astype(np.float32)), use.sampler)
+            texture = self.surfaces.add_picture(color.linear_to_srgb((values / most).astype(np.float32)), use.sampler)
             entry["emissiveTexture"] = self._slot(texture, use.layout)
             glow = [most] * 3
         glow = [max(channel, 0.0) for channel in glow]

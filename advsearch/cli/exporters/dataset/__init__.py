@@ -6,20 +6,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.cli.output import at_work
-from advsearch.errors import InputError
-from advsearch.runs.exporters import Exported, Exporter
+from advsearch.extend import Exported, Exporter, InputError, Progress
 
 
 class _Dataset(Exporter):
     writes = "a folder"
     options = ("all",)
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any]) -> Exported:
-        with at_work(as_json=True, quiet=False) as progress:
-            from advsearch.api.dataset import write_dataset  # takes seconds
+    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+        from advsearch.cli.exporters.dataset.files import write_dataset  # takes seconds
 
-            count, notes = write_dataset(run, out, self.name, every=bool(options["all"]), progress=progress)
+        count, notes = write_dataset(run, out, self.name, every=bool(options["all"]), progress=progress)
         if not count:
             raise InputError(f"{run}: no model is wrong in a picture of its rows; --all takes the others too")
         return Exported({"pictures": count, "notes": notes}, " ".join([f"{count} pictures in {out}.", *notes]))

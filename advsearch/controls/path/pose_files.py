@@ -19,10 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from advsearch.errors import FileFormatError
-from advsearch.scene.assets import Doubles
-from advsearch.scene.importing.files import is_number, shown
-from advsearch.scene.importing.unread import join_names
+from advsearch.extend import FileFormatError, parts, reading
 
 MAX_COLUMNS = 64
 MAX_ROWS = 100_000
@@ -42,7 +39,7 @@ QUATERNION_NAME = re.compile(r"q(?:uat(?:ernion)?)?(?:_\w+)?[._]?([wxyz])|(?:rot
 UNIT = re.compile(r"\[([^\]]*)\]")
 
 OPTICAL, UNUSED = "optical", "none"
-SENSOR_AXES: Mapping[str, Doubles] = {
+SENSOR_AXES: Mapping[str, parts.Doubles] = {
     OPTICAL: np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "flu": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
@@ -58,7 +55,7 @@ AXES_MEAN: Mapping[str, str] = {
     "euroc": "x up, y right, z ahead",
     UNUSED: "not read: the camera looks at the object",
 }
-WORLD_TO_Z_UP: Mapping[str, Doubles] = {
+WORLD_TO_Z_UP: Mapping[str, parts.Doubles] = {
     "z": np.eye(3),
     "-z": np.diag([1.0, -1.0, -1.0]),
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
@@ -80,8 +77,8 @@ class Trajectory:
     """Poses from a file, as they stand in it, but for times in seconds."""
 
     format: PoseFormat
-    times: Doubles | None  # (n,) seconds; None where the file has none
-    positions: Doubles  # (n, 3)
+    times: parts.Doubles | None  # (n,) seconds; None where the file has none
+    positions: parts.Doubles  # (n, 3)
     rotations: Rotation | None  # from the sensor's axes to the world's; None where the file has none
     notes: tuple[str, ...]
 
@@ -89,7 +86,7 @@ class Trajectory:
     def default_up(self) -> str:
         return "-y" if self.format is PoseFormat.KITTI else "z"
 
-    def orient(self, axes: str, up: str, origin: Sequence[float]) -> tuple[Doubles, Rotation | None]:
+    def orient(self, axes: str, up: str, origin: Sequence[float]) -> tuple[parts.Doubles, Rotation | None]:
         """Return positions (n, 3) from an origin, and rotations from a camera's axes (x right, y down, z ahead), both
         in a world whose z is up; no rotations where the axes are `UNUSED` or the file has none."""
         world = Rotation.from_matrix(WORLD_TO_Z_UP[up])
@@ -142,7 +139,7 @@ def _split(line: str) -> list[str]:
 
 
 def _is_row(line: str) -> bool:
-    return not line.startswith("#") and all(map(is_number, _split(line)))
+    return not line.startswith("#") and all(map(reading.is_number, _split(line)))
 
 
 def _find_columns(names: Sequence[str]) -> dict[str, int]:
@@ -171,10 +168,10 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
     return {} if is_own else columns
 
 
-def _read_table(path: Path, rows: Sequence[Sequence[str]], count: int) -> Doubles:
+def _read_table(path: Path, rows: Sequence[Sequence[str]], count: int) -> parts.Doubles:
     for row in rows:
-        if len(row) != count or not all(map(is_number, row)):
-            raise FileFormatError(f"{path}: expected {count} numbers in each row, got {shown(' '.join(row))}")
+        if len(row) != count or not all(map(reading.is_number, row)):
+            raise FileFormatError(f"{path}: expected {count} numbers in each row, got {reading.shown(' '.join(row))}")
     table = np.array(rows, dtype=object).astype(np.float64)
     if not np.isfinite(table).all():
         raise FileFormatError(f"{path}: expected finite numbers, got others")
@@ -187,14 +184,14 @@ def _read_named_columns(
     columns = _find_columns(names)
     table = _read_table(path, rows, len(names))
     unread = [name for index, name in enumerate(names) if index not in columns.values()]
-    notes = [f"{path}: not read: {join_names(unread)}."] if unread else []
+    notes = [f"{path}: not read: {reading.join_names(unread)}."] if unread else []
 
     times = table[:, columns["time"]]
     stated = UNIT.search(names[columns["time"]])
     unit = stated[1].strip() if stated else "s"
     if unit not in UNITS:
         raise FileFormatError(
-            f"{path}: expected times in {', '.join(UNITS)}, got {shown(unit)}; correct the first line"
+            f"{path}: expected times in {', '.join(UNITS)}, got {reading.shown(unit)}; correct the first line"
         )
     if not stated:
         unit = next((unit for least, unit in UNIT_BY_SIZE if abs(times[0]) >= least), "s")

@@ -4,7 +4,7 @@
     between two of them their parameters interpolated
 
 They are those of ImageNet-C (Hendrycks & Dietterich 2019, arXiv 1903.12261, section 4 and appendix A) as functions of
-the picture in torch; those by noise, blur, shifted pixels and weather are in `corruption_filters`.
+the picture in torch; those by noise, blur, shifted pixels and weather are in `filters`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.controls import corruption_filters as filters
-from advsearch.controls.base import Choice, Control, Parameter, Value, Values, measure, named, number
-from advsearch.controls.support.images import coded
+from advsearch.controls.corruption import filters
+from advsearch.extend import Choice, Control, Parameter, Value, Values, images
 
 BRIGHTNESS = ((0.1,), (0.2,), (0.3,), (0.4,), (0.5,))  # added to the value of hue, saturation and value
 CONTRAST = ((0.4,), (0.3,), (0.2,), (0.1,), (0.05,))  # factor on the distance from the mean
@@ -60,13 +59,13 @@ def pixelate(image: Tensor, whole: int) -> Tensor:
     height, width = image.shape[:2]
     share = PIXELATE[whole - 1] / max(1.0, min(height, width) / filters.REFERENCE)
     cells = (max(1, int(height * share)), max(1, int(width * share)))
-    averaged = F.interpolate(filters.planes(image), cells, mode="area")
-    return filters.picture(F.interpolate(averaged, (height, width), mode="nearest-exact"))
+    averaged = F.interpolate(images.planes(image), cells, mode="area")
+    return images.picture(F.interpolate(averaged, (height, width), mode="nearest-exact"))
 
 
 def jpeg(image: Tensor, whole: int) -> Tensor:
     """Save as a JPEG file of the severity's quality and read it again; see `coded`."""
-    return coded(image, JPEG[whole - 1])
+    return images.coded(image, JPEG[whole - 1])
 
 
 SMOOTH: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
@@ -91,9 +90,10 @@ class CorruptionControl(Control):
     kind = "corruption"
     amount = "severity"
     parameters = (
-        replace(named("which", NAMES, NAMES[0], "Which corruption."), search=(0, len(NAMES) - 1)),
-        number(("image",), "severity", "1", 0.0, float(filters.LEVELS), 0.0,
-               "How strong it is: 0 is none, 1 to 5 are the published severities.", (0.0, float(filters.LEVELS))),
+        replace(Parameter.named("which", NAMES, NAMES[0], "Which corruption."), search=(0, len(NAMES) - 1)),
+        Parameter.number(("image",), "severity", "1", 0.0, float(filters.LEVELS), 0.0,
+                         "How strong it is: 0 is none, 1 to 5 are the published severities.",
+                         (0.0, float(filters.LEVELS))),
     )  # fmt: skip
     choices = (Choice("seed", 0, "Which draw of the noise, the snow, the wrinkles: a whole number from 0.",
                       whole=(0, 2**32 - 1)),)  # fmt: skip
@@ -113,7 +113,7 @@ class CorruptionControl(Control):
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         severity = values["severity"]
         applied = nearest(severity) if NAMES[int(values["which"])] in STEPPED else float(severity)
-        return {"applied": measure(applied, "1")}
+        return {"applied": Value(value=float(applied), unit="1")}
 
 
 def corrupted(image: Tensor, which: str, severity: Tensor, seed: int = 0) -> Tensor:

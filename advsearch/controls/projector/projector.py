@@ -23,20 +23,21 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.controls.base import LARGEST_EPSILON, Choice, Value, Values, measure, number
-from advsearch.controls.corruption_filters import picture, planes
-from advsearch.controls.ranges import Fixed, Range
-from advsearch.controls.support.images import PRINT_SIDE, enlarged
-from advsearch.controls.support.norms import NORMS, radius
-from advsearch.controls.support.picture_control import PictureControl
-from advsearch.errors import InputError
-from advsearch.scene.color import srgb_to_linear, to_8_bit
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import METERED_WHITE, WHITE, metered_gain
-from advsearch.scene.geometry import affine, camera_axes, camera_to_world, middle
-from advsearch.scene.gradients import WHOLE_RANGE, Budget
-from advsearch.scene.parts import ProjectorPart
-from advsearch.scene.settings import LIT, Parameter, moving
+from advsearch.extend import (
+    Choice,
+    Fixed,
+    InputError,
+    Parameter,
+    PictureControl,
+    Range,
+    SceneDescription,
+    Value,
+    Values,
+    color,
+    geometry,
+    images,
+    parts,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -49,7 +50,7 @@ GREY = 0.5
 LIT_SHARE = 0.5  # of its period, in which a flashing light is on
 
 
-_lit, _moving = partial(number, LIT), partial(moving, ("differences",))
+_lit, _moving = partial(Parameter.number, Parameter.LIT), partial(Parameter.moving, ("differences",))
 
 
 class ProjectorControl(PictureControl):
@@ -58,11 +59,12 @@ class ProjectorControl(PictureControl):
     Its texels are searched, and numbers where they get a range.
     """
 
-    part: ProjectorPart
+    part: parts.ProjectorPart
     _later = 0.0
     kind = "projector"
     competes_with_ambient = True
     shown = "pattern"
+    default_epsilon = 1.0  # every picture is inside
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("pattern", (None, None, 3), "sRGB", 0.0, 1.0, "black, or grey",
                   "Display-referred texels of the picture, rounded to 8 bits.", search=(0.0, 1.0),
@@ -79,11 +81,11 @@ class ProjectorControl(PictureControl):
         _lit("black", "1", 0.0, 1.0, 0.0,
              "Share of white that a black texel still throws: 0.001 at a contrast of 1000."),
         _lit("blur", "texels", 0.0, 64.0, 0.0, "How far it is out of focus: standard deviation of the blur."),
-        number(("differences",), "flicker", "Hz", 0.0, 1e5, 0.0,
-               "How often a second it flashes: light in one half of each period; at 0 it does not."),
-        number(("differences",), "phase", "degrees", -3600.0, 3600.0, 0.0,
-               "Where in its period a flashing light is at the time of the picture; up to 180 it is on.",
-               periodic=True),
+        Parameter.number(("differences",), "flicker", "Hz", 0.0, 1e5, 0.0,
+                         "How often a second it flashes: light in one half of each period; at 0 it does not."),
+        Parameter.number(("differences",), "phase", "degrees", -3600.0, 3600.0, 0.0,
+                         "Where in its period a flashing light is at the time of the picture; up to 180 it is on.",
+                         periodic=True),
     )  # fmt: skip
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("resolution", 64, "Rows of texels.", whole=(2, 512)),
@@ -91,9 +93,9 @@ class ProjectorControl(PictureControl):
         Choice("fov", None, "Angle of the picture's width, degrees; by default it just covers the object.", most=150.0),
         Choice("start", "black", "What the search begins with: black or grey.", options=("black", "grey")),
         Choice("norm", "linf", "Norm of the ball around that start: linf (per texel value) or l2 (over all of them).",
-               "norm", options=NORMS),
+               "norm", options=("linf", "l2")),
         Choice("epsilon", None, "Radius of that ball, display-referred; by default every picture is inside.", "epsilon",
-               most=LARGEST_EPSILON),
+               most=PictureControl.LARGEST_EPSILON),
         Choice("picture", None, "A picture file to project as it is; then the pattern is not searched.",
                fixes="pattern"),
     )  # fmt: skip
@@ -124,10 +126,10 @@ class ProjectorControl(PictureControl):
         columns = max(2, round(rows * self.chosen["aspect"])) if picture is None else picture.shape[1]
         fov = self.chosen["fov"]
         if fov is None:  # with which the picture covers the object from where it stands at the start
-            farthest = float(np.linalg.norm(scene.base_vertices - middle(scene), axis=1).max())
+            farthest = float(np.linalg.norm(scene.base_vertices - geometry.middle(scene), axis=1).max())
             reach = farthest * max(1.0, columns / rows) * scene.metres
             fov = min(math.degrees(2.0 * math.atan(reach / self.within(scene)._far())), 150.0)
-        part = ProjectorPart(self.name, float(fov), (rows, columns))
+        part = parts.ProjectorPart(self.name, float(fov), (rows, columns))
         if scene.environment is None or scene.environment.candelas is None:
             note = (
                 f"The place's brightness has no unit: its light is taken for {AMBIENT:g} lux; "
@@ -138,14 +140,14 @@ class ProjectorControl(PictureControl):
 
     def in_scene(self, parameter: Parameter) -> Parameter:
         parameter, scene = super().in_scene(parameter), self.scene
-        away = camera_to_world(scene)[:3, 3] - middle(scene)
+        away = geometry.camera_to_world(scene)[:3, 3] - geometry.middle(scene)
         far = float(np.linalg.norm(away))
         match parameter.name:
             case "pattern":
                 return replace(parameter, default=GREY if self.chosen["start"] == "grey" else 0.0)
             case "ambient":
                 candelas = None if scene.environment is None else scene.environment.candelas
-                lux = AMBIENT if candelas is None else min(max(candelas * ambient_irradiance(scene), 1e-3), 2e5)
+                lux = AMBIENT if candelas is None else min(max(candelas * scene.metered_irradiance, 1e-3), 2e5)
                 return replace(parameter, default=lux)
             case "lumens":
                 bright = TIMES * float(self.resting("ambient")) * self.part.area * self._far() ** 2
@@ -168,15 +170,10 @@ class ProjectorControl(PictureControl):
         spec = self.specs.get("distance")
         return float(spec.value if isinstance(spec, Fixed) else self.resting("distance"))
 
-    def budget_of(self, parameter: Parameter) -> Budget:
-        if parameter.name != "pattern":
-            return WHOLE_RANGE
-        norm, epsilon, count = self.chosen["norm"], self.chosen["epsilon"], 3 * math.prod(self.sides)
-        whole = 1.0 if norm == "linf" else math.sqrt(count)
-        return Budget(norm, whole if epsilon is None else radius(norm, epsilon, count))
-
     def fit(self) -> None:
-        (self.part,) = (part for part in self.scene.parts if isinstance(part, ProjectorPart) and part.name == self.name)
+        (self.part,) = (
+            part for part in self.scene.parts if isinstance(part, parts.ProjectorPart) and part.name == self.name
+        )
         self._picture = self.read_picture()
         super().fit()
         rate = next(slot.spec for slot in self.slots if slot.parameter.name == "flicker")
@@ -212,7 +209,7 @@ class ProjectorControl(PictureControl):
     def values(self, u: Tensor) -> dict[str, Tensor]:
         values = super().values(u)
         pattern = values["pattern"]
-        rounded = pattern + (to_8_bit(pattern.detach()) - pattern.detach())  # a projector gets 8 bits
+        rounded = pattern + (images.to_8_bit(pattern.detach()) - pattern.detach())  # a projector gets 8 bits
         return values | {"pattern": rounded}
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -223,12 +220,12 @@ class ProjectorControl(PictureControl):
         if rate and (rate * self._later + phase) % 1.0 >= LIT_SHARE:
             light = 0.0 * light
         at_one = self._beside(values) * (values["distance"].detach() / self.scene.metres) ** 2
-        white = at_one * ambient_irradiance(self.scene) / math.pi
+        white = at_one * self.scene.metered_irradiance / math.pi
         return {f"{self.name}.pose": pose, f"{self.name}.pattern": light * white}
 
     def thrown(self, values: Values) -> Tensor:
         """Return the picture (h, w, 3) as it is thrown, of white, linear."""
-        light = srgb_to_linear(values["pattern"]) * (1.0 - values["black"]) + values["black"]
+        light = color.srgb_to_linear(values["pattern"]) * (1.0 - values["black"]) + values["black"]
         return out_of_focus(light, values["blur"])
 
     def _lux(self, values: Values) -> Tensor:
@@ -240,14 +237,17 @@ class ProjectorControl(PictureControl):
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         return {
-            "white": measure(self._lux(values), "lux"),
-            "beside_ambient": measure(self._beside(values), "times the ambient light"),
-            "mean": measure(srgb_to_linear(values["pattern"]).mean(), "of white"),
+            "white": Value(value=float(self._lux(values)), unit="lux"),
+            "beside_ambient": Value(value=float(self._beside(values)), unit="times the ambient light"),
+            "mean": Value(value=float(color.srgb_to_linear(values["pattern"]).mean()), unit="of white"),
         }
 
     def kept_pictures(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         pattern = values["pattern"]
-        return {self.name: pattern, f"{self.name}-large": enlarged(pattern, -(-PRINT_SIDE // len(pattern)))}
+        return {
+            self.name: pattern,
+            f"{self.name}-large": images.enlarged(pattern, -(-images.PRINT_SIDE // len(pattern))),
+        }
 
 
 def out_of_focus(light: Tensor, blur: Tensor) -> Tensor:
@@ -258,19 +258,14 @@ def out_of_focus(light: Tensor, blur: Tensor) -> Tensor:
     reach = math.ceil(3.0 * sigma) + 1
     kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1).to(blur) / blur.clamp_min(0.1)) ** 2)
     kernel = (kernel / kernel.sum()).expand(3, 1, 1, -1)
-    rows = functional.conv2d(planes(light), kernel, padding=(0, reach), groups=3)
-    return picture(functional.conv2d(rows, kernel.transpose(2, 3), padding=(reach, 0), groups=3))
+    rows = functional.conv2d(images.planes(light), kernel, padding=(0, reach), groups=3)
+    return images.picture(functional.conv2d(rows, kernel.transpose(2, 3), padding=(reach, 0), groups=3))
 
 
 @lru_cache(maxsize=64)
 def looking_from(scene: SceneDescription, azimuth: float, elevation: float, distance: float) -> Tensor:
     """The pose (4, 4) of what looks at the object's middle along its own +z from somewhere around it; degrees, and the
     distance as `ProjectorControl` has it. It is not to be written into."""
-    left, up, outwards = torch.from_numpy(camera_axes(azimuth, elevation, 0.0)).float()
-    place = torch.from_numpy(middle(scene)).float() + distance / scene.metres * outwards
-    return affine(torch.stack([left, up, -outwards], dim=1), place)
-
-
-def ambient_irradiance(scene: SceneDescription) -> float:
-    """Return the irradiance for which the exposure of a scene's pictures is metered, in scene units."""
-    return METERED_WHITE * math.pi / (WHITE * metered_gain(scene))
+    left, up, outwards = torch.from_numpy(geometry.camera_axes(azimuth, elevation, 0.0)).float()
+    place = torch.from_numpy(geometry.middle(scene)).float() + distance / scene.metres * outwards
+    return geometry.affine(torch.stack([left, up, -outwards], dim=1), place)

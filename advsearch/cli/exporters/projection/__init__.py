@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.cli.output import at_work
-from advsearch.runs.exporters import Exported, Exporter
+from advsearch.extend import Exported, Exporter, Progress
 
 
 class Projection(Exporter):
@@ -17,9 +16,8 @@ class Projection(Exporter):
     writes = "a new folder"
     example = "export mug-projector-001 --format projector --out folder"
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any]) -> Exported:
-        with at_work(as_json=True, quiet=False):
-            from advsearch.api.projection import write_projection  # takes seconds
+    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+        from advsearch.cli.exporters.projection.images import write_projection  # takes seconds
 
-            notes = write_projection(run, out)
+        notes = write_projection(run, out)
         return Exported({"notes": notes}, "\n".join([f"What to project is in {out}. Set:", *notes]))

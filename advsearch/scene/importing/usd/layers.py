@@ -17,12 +17,8 @@ from typing import Any
 
 from pxr import Ar, Sdf
 
-from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import shown
+from advsearch.extend import FileFormatError, reading, stored_files
 from advsearch.scene.importing.usd import LAYERS, PACKAGE
-from advsearch.trust import stored_files
-from advsearch.trust.named_files import is_inside
-from advsearch.trust.stored_files import LARGEST_FILE, check_most, scaled
 
 MOST_LAYERS = 1000
 MOST_ENTRIES = 10_000
@@ -54,9 +50,10 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
         entries = archive.infolist()
         size = sum(entry.file_size for entry in entries)
         got = f"{len(entries):,} of {size:,}"
-        most = f"at most {scaled(MOST_ENTRIES):,} files of {scaled(LARGEST_FILE):,} bytes in all"
-        check_most(name, len(entries), MOST_ENTRIES, most, got)
-        check_most(name, size, LARGEST_FILE, most, got)
+        max_files, max_bytes = map(stored_files.scaled, (MOST_ENTRIES, stored_files.LARGEST_FILE))
+        most = f"at most {max_files:,} files of {max_bytes:,} bytes in all"
+        stored_files.check_most(name, len(entries), MOST_ENTRIES, most, got)
+        stored_files.check_most(name, size, stored_files.LARGEST_FILE, most, got)
         for entry in entries:
             place = PurePosixPath(entry.filename)
             odd = place.is_absolute() or ".." in place.parts or re.search(r"[\\:\[\]]", entry.filename)
@@ -100,7 +97,7 @@ def read_packaged(path: str) -> bytes:
     Raises FileFormatError: as `open_package`. Raises KeyError: there is no such file.
     """
     outer, inner = Ar.SplitPackageRelativePathOuter(path)
-    content = stored_files.read_bytes(Path(outer), "a package", LARGEST_FILE)
+    content = stored_files.read_bytes(Path(outer), "a package", stored_files.LARGEST_FILE)
     while inner:
         name, inner = Ar.SplitPackageRelativePathOuter(inner)
         with open_package(Path(outer).name, content) as archive:
@@ -137,7 +134,7 @@ class _LayerCheck:
             known[path] = None
             self._take(path.stat().st_size)
             if path.suffix.lower() == PACKAGE:
-                content = stored_files.read_bytes(path, "a package", LARGEST_FILE)
+                content = stored_files.read_bytes(path, "a package", stored_files.LARGEST_FILE)
                 self._check_package(path.name, str(path), content, depth=1)
                 continue
             for name in self._named_in(str(path), path.name):
@@ -148,9 +145,9 @@ class _LayerCheck:
         """Count a layer of a size in bytes against the limits."""
         self._count += 1
         self._size += size
-        most = f"at most {scaled(MOST_LAYERS):,} layers"
-        check_most(self.file.name, self._count, MOST_LAYERS, most, "more, or larger ones")
-        check_most(self.file.name, self._size, LARGEST_FILE, most, "more, or larger ones")
+        most = f"at most {stored_files.scaled(MOST_LAYERS):,} layers"
+        stored_files.check_most(self.file.name, self._count, MOST_LAYERS, most, "more, or larger ones")
+        stored_files.check_most(self.file.name, self._size, stored_files.LARGEST_FILE, most, "more, or larger ones")
 
     def _find(self, path: Path, name: str) -> Path:
         """Return the file that a layer names, of a file in a package the package."""
@@ -159,7 +156,7 @@ class _LayerCheck:
         is_plain = not any(sign in outer for sign in "`[]:\0") and suffix in (*LAYERS, PACKAGE)
         is_plain = is_plain and (not inner or suffix == PACKAGE)
         target = Path(os.path.realpath(path.parent / outer)) if is_plain else self._folder
-        if not is_plain or not is_inside(target, self._folder):
+        if not is_plain or not reading.is_inside(target, self._folder):
             raise FileFormatError(
                 f"{self.file.name}: names the layer {name[:100]!r}, which is no USD file in its folder and is not "
                 "read; put it there, or make one file of all with usdcat --flatten"
@@ -177,7 +174,7 @@ class _LayerCheck:
 
     def _check_package(self, name: str, path: str, content: bytes, depth: int) -> None:
         """Check all layers in a package; `path` is what USD calls it."""
-        check_most(self.file.name, depth, DEEPEST_PACKAGE, "packages in at most {} others", "more")
+        stored_files.check_most(self.file.name, depth, DEEPEST_PACKAGE, "packages in at most {} others", "more")
         with open_package(name, content) as archive:
             _check_without_gaps(name, archive, content)
             entries = {entry.filename for entry in archive.infolist() if not entry.is_dir()}
@@ -189,7 +186,7 @@ class _LayerCheck:
                     self._check_package(f"{name}[{entry}]", inner_path, archive.read(entry), depth + 1)
                 elif suffix in LAYERS:
                     self._take(0)  # its bytes are those of the package
-                    for named in self._named_in(inner_path, f"{name}[{shown(entry, quoted=False)}]"):
+                    for named in self._named_in(inner_path, f"{name}[{reading.shown(entry, quoted=False)}]"):
                         self._check_packaged(name, entry, named, entries)
 
     def _check_packaged(self, package: str, entry: str, named: str, entries: set[str]) -> None:

@@ -5,7 +5,7 @@ was asked for (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4):
 
     place = camera + distance * turned(line of sight, direction, angle),    hidden(angle) = coverage
 
-`angle` is found by bisection on rasterised silhouettes (`scene.silhouettes`).
+`angle` is found by bisection on rasterised silhouettes (`silhouettes`).
 """
 
 from __future__ import annotations
@@ -21,21 +21,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Control, Value, Values, measure, named
-from advsearch.controls.support.meshes import sphere
-from advsearch.controls.support.visibility import SURROUNDINGS, camera_in, put_away
-from advsearch.errors import InputError
-from advsearch.scene import library, silhouettes
-from advsearch.scene.assets import Doubles, Material, Mesh, ObjectAsset, normalised
-from advsearch.scene.camera_model import CameraModel
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import affine, camera_to_world, object_to_world, rotation
-from advsearch.scene.importing.objects import import_object
-from advsearch.scene.parts import MeshPart
-from advsearch.scene.settings import ORBIT, moving
-from advsearch.trust.stored_files import reading
+from advsearch.controls.occlusion import silhouettes
+from advsearch.extend import Choice, Control, InputError, Parameter, SceneDescription, Value, Values, geometry, parts
 
-_moving = partial(moving, ORBIT)
+_moving = partial(Parameter.moving, Parameter.ORBIT)
 
 MADE = ("card", "sphere")
 BUNDLED = ("book", "bottle", "vase", "chair", "banana", "hammer")
@@ -46,23 +35,21 @@ CLEARANCE = 0.05  # smallest distance in object sizes between the camera and the
 
 
 @cache
-def loaded(spec: str) -> ObjectAsset:
+def loaded(spec: str) -> parts.ObjectAsset:
     """Return a bundled object or one from a mesh file, its largest extent 1, centred on the origin. Raises InputError
     where there is no such object, or the file cannot be used."""
-    is_file = "/" in spec or "\\" in spec or Path(spec).suffix != ""
-    with reading(spec):
-        asset = import_object(Path(spec)) if is_file else library.load_object(spec)
-        mesh = normalised(asset.mesh)
-        middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0
-        return replace(asset, mesh=replace(mesh, vertices=(mesh.vertices - middle).astype(np.float32)))
+    asset = SceneDescription.load_object(spec)
+    mesh = parts.normalised(asset.mesh)
+    middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0
+    return replace(asset, mesh=replace(mesh, vertices=(mesh.vertices - middle).astype(np.float32)))
 
 
-def _asset(option: str) -> ObjectAsset:
+def _asset(option: str) -> parts.ObjectAsset:
     return made(option) if option in MADE else loaded(option)
 
 
 @cache
-def made(name: str) -> ObjectAsset:
+def made(name: str) -> parts.ObjectAsset:
     """Return one of the occluders made here, one object size large around the origin: "card" or "sphere"."""
     generator = np.random.Generator(np.random.PCG64(7))
     if name == "card":
@@ -71,17 +58,17 @@ def made(name: str) -> ObjectAsset:
         uvs = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32)
         vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1).astype(np.float32)
         normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
-        card = Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
-        return ObjectAsset(name, card, texels.clip(0.0, 1.0).astype(np.float32), Material(roughness=0.9))
+        card = parts.Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
+        return parts.ObjectAsset(name, card, texels.clip(0.0, 1.0).astype(np.float32), parts.Material(roughness=0.9))
     grey = np.full((4, 4, 3), 0.5, dtype=np.float32)
-    return ObjectAsset(name, sphere(24, 48), grey, Material(roughness=0.6))
+    return parts.ObjectAsset(name, parts.sphere(24, 48), grey, parts.Material(roughness=0.6))
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
     """Where an occluder goes, in the camera's coordinates; lengths are in object sizes."""
 
-    axes: Doubles  # (3, 3) rows: right, up and forward of a camera that looks at the middle of what is seen
+    axes: parts.Doubles  # (3, 3) rows: right, up and forward of a camera that looks at the middle of what is seen
     angle: float  # from that middle to the occluder, radians
     size: float  # made smaller where it would not fit
     distance: float  # from the camera, changed where it would not fit
@@ -94,10 +81,12 @@ class OcclusionControl(Control):
 
     kind = "occlusion"
     amount = "coverage"
-    refines = frozenset(SURROUNDINGS)  # none is changed; but it comes after whatever moves the camera or the object
+    # none is changed; but it comes after whatever moves the camera or the object
+    refines = frozenset(geometry.SURROUNDINGS)
     parameters = (
-        named("which", OPTIONS, "card", "What it is: a piece of cardboard, a grey sphere, or a bundled object.",
-              estimators=("differences",), moves_silhouettes=True),
+        Parameter.named("which", OPTIONS, "card",
+                        "What it is: a piece of cardboard, a grey sphere, or a bundled object.",
+                        estimators=("differences",), moves_silhouettes=True),
         _moving("coverage", "1", 0.0, 0.9, 0.0,
                 "Share of the object's picture area that it hides; at 0 it is out of the frame.", (0.0, 0.5)),
         _moving("direction", "degrees", -3600.0, 3600.0, 0.0,
@@ -126,17 +115,17 @@ class OcclusionControl(Control):
         self._given["object"] = self.chosen["object"] = str(occluder)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        away = put_away(torch.from_numpy(camera_to_world(scene))).numpy()
+        away = geometry.put_away(torch.from_numpy(geometry.camera_to_world(scene))).numpy()
         for option in self._candidates():
             asset = _asset(option)
             looks = asset.base_color, asset.material, asset.label
-            scene = scene.with_part(MeshPart(self._part(option), asset.mesh, *looks, to_world=away))
+            scene = scene.with_part(parts.MeshPart(self._part(option), asset.mesh, *looks, to_world=away))
         return scene
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         chosen = self._option(values)
-        camera = camera_in(self.scene, so_far).to(values["turn"])
-        inputs = {f"{self._part(one)}.to_world": put_away(camera) for one in self._candidates()}
+        camera = geometry.camera_in(self.scene, so_far).to(values["turn"])
+        inputs = {f"{self._part(one)}.to_world": geometry.put_away(camera) for one in self._candidates()}
         placed = self.placement(values, so_far)
         if not placed.away:
             inputs[f"{self._part(chosen)}.to_world"] = _matrix(camera, placed, values)
@@ -145,11 +134,11 @@ class OcclusionControl(Control):
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         """What is hidden of the object, and what became of the size and the distance that were asked for."""
         placed = self.placement(values, so_far)
-        hidden = {"hidden": measure(placed.hidden, "1")}
+        hidden = {"hidden": Value(value=float(placed.hidden), unit="1")}
         if placed.away:
             return hidden
         sizes = {"true_size": placed.size, "true_distance": placed.distance}
-        return hidden | {name: measure(value, "object sizes") for name, value in sizes.items()}
+        return hidden | {name: Value(value=float(value), unit="object sizes") for name, value in sizes.items()}
 
     def _candidates(self) -> tuple[str, ...]:
         """Every occluder that can be chosen; each is a part of the scene."""
@@ -172,7 +161,7 @@ class OcclusionControl(Control):
         mesh = _asset(self._option(values)).mesh
         if seen.directions is None or asked["coverage"] <= 0.0:
             return Placement(np.eye(3), 0.0, asked["size"], asked["distance"] * seen.far, 0.0, True)
-        points = mesh.vertices.astype(np.float64) @ rotation(asked["turn"], 0.0, 0.0).T
+        points = mesh.vertices.astype(np.float64) @ geometry.rotation(asked["turn"], 0.0, 0.0).T
         size, distance = _fitting(points, asked["size"], asked["distance"] * seen.far, seen.near)
         ahead = np.stack([points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size], axis=1)
         cover = silhouettes.silhouette(ahead, mesh.faces)
@@ -194,16 +183,18 @@ class OcclusionControl(Control):
 class _Seen:
     """The object as the camera sees it."""
 
-    directions: Doubles | None  # (N, 3) in which it is seen, each for the same area; None if it is not in the picture
-    shown: Doubles  # (M, 3) directions spread over the whole picture
-    rim: Doubles  # (K, 3) those at its edge
+    directions: (
+        parts.Doubles | None
+    )  # (N, 3) in which it is seen, each for the same area; None if it is not in the picture
+    shown: parts.Doubles  # (M, 3) directions spread over the whole picture
+    rim: parts.Doubles  # (K, 3) those at its edge
     near: float  # distance of its nearest vertex from the camera
     far: float  # distance of the middle of its bounding box
 
     @staticmethod
     def of(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> _Seen:
-        camera = camera_in(scene, so_far).detach().double().cpu().numpy()
-        pose = _numpy(so_far, "object.to_world", object_to_world(scene))
+        camera = geometry.camera_in(scene, so_far).detach().double().cpu().numpy()
+        pose = _numpy(so_far, "object.to_world", geometry.object_to_world(scene))
         mesh = scene.object.mesh
         vertices = mesh.vertices.astype(np.float64) + _numpy(so_far, "object.offsets", np.zeros(3))
         world = vertices @ pose[:3, :3].T + pose[:3, 3]
@@ -216,16 +207,16 @@ class _Seen:
         else:
             fov = float(_numpy(so_far, "camera.fov", np.array([scene.number("camera.fov")]))[0])
             shift = _numpy(so_far, "camera.shift", np.zeros(2))
-            frame = silhouettes.Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
+            frame = geometry.Frame.of(fov, scene.aspect, (float(shift[0]), float(shift[1])))
             silhouette = silhouettes.silhouette(points, mesh.faces, frame)
-            shown, rim = frame.spread(), frame.corners()
+            shown, rim = silhouettes.spread_directions(frame), frame.corners()
             directions = None if silhouette is None else silhouette.directions()
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
         near, far = float(np.linalg.norm(points, axis=1).min()), float(np.linalg.norm(middle))
         return _Seen(directions, shown, rim, near, far)
 
 
-def _through(model: CameraModel, points: Doubles, faces: npt.NDArray[np.uint32]) -> Doubles | None:
+def _through(model: geometry.CameraModel, points: parts.Doubles, faces: npt.NDArray[np.uint32]) -> parts.Doubles | None:
     """Unit directions (N, 3) in which a mesh, with vertices (V, 3) in camera coordinates, is seen through a lens, each
     for the same area of the picture, or None."""
     axes = silhouettes.middle_axes(points / np.linalg.norm(points, axis=1, keepdims=True))
@@ -243,7 +234,9 @@ def _through(model: CameraModel, points: Doubles, faces: npt.NDArray[np.uint32])
     return hidden if len(hidden) else None
 
 
-def _looked(model: CameraModel, across: tuple[float, float], down: tuple[float, float], count: int) -> Doubles:
+def _looked(
+    model: geometry.CameraModel, across: tuple[float, float], down: tuple[float, float], count: int
+) -> parts.Doubles:
     """Unit directions (N, 3) in which a lens sees a part of the picture: as `Silhouette.directions`, in it."""
     row, column = np.divmod(np.arange(count * count), count)
     number = np.arange(count * count)
@@ -256,14 +249,14 @@ def _looked(model: CameraModel, across: tuple[float, float], down: tuple[float, 
     return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
-def _numpy(inputs: Mapping[str, Tensor], name: str, otherwise: Doubles) -> Doubles:
+def _numpy(inputs: Mapping[str, Tensor], name: str, otherwise: parts.Doubles) -> parts.Doubles:
     return inputs[name].detach().double().cpu().numpy() if name in inputs else otherwise
 
 
 # ---- where the occluder goes ----------------------------------------------------------------------------------------
 
 
-def _fitting(points: Doubles, size: float, distance: float, near: float) -> tuple[float, float]:
+def _fitting(points: parts.Doubles, size: float, distance: float, near: float) -> tuple[float, float]:
     """Return a size and a distance close to those asked for with which an occluder with points (V, 3), one object size
     large around the origin, is between the camera and the object, whose nearest vertex is at `near`. It keeps
     `CLEARANCE` from the camera, and no vertex is farther from the camera than the object's nearest one. Where its size
@@ -299,4 +292,4 @@ def _matrix(camera: Tensor, placed: Placement, values: Values) -> Tensor:
     to_world = camera[:3, :3] * torch.tensor([-1.0, 1.0, 1.0]).to(camera)
     linear = placed.size * to_world @ torch.stack([x, y, up], dim=1)
     place = camera[:3, 3] + placed.distance * (to_world @ ahead)
-    return affine(linear, place)
+    return geometry.affine(linear, place)

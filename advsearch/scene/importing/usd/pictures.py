@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from advsearch.pictures import FORMATS, check_decodable
-from advsearch.scene.color import srgb_to_linear
+from advsearch.extend import color, reading
 
 Array = npt.NDArray[Any]
 EXR, RADIANCE, PNG = b"\x76\x2f\x31\x01", b"#?", b"\x89PNG"  # how files begin
@@ -26,7 +25,7 @@ CHANNELS_OF_PNG = {0: 1, 2: 3, 4: 2, 6: 4}  # by the color type
 def is_of_8_bits(data: bytes) -> bool:
     """Whether a file is a picture with 8 bits a channel."""
     try:
-        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+        with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
             return image.mode in MODES_OF_8_BITS and not _is_png_of_16_bits(data)
     except (OSError, ValueError, SyntaxError):
         return False
@@ -36,14 +35,14 @@ def has_colors_of_8_bits(data: bytes) -> bool:
     """Whether a file is a picture with 8 bits a channel, and three channels or four."""
     if not is_of_8_bits(data):
         return False
-    with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+    with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
         return image.mode not in GREY_MODES
 
 
 def is_marked_srgb(data: bytes) -> bool:
     """Whether a picture is in sRGB for the sourceColorSpace auto: its file says so, or else it has colors of 8 bits."""
     try:
-        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+        with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
             gamma = image.info.get("gamma")
             profile = image.info.get("icc_profile") or b""
             if "srgb" in image.info or b"sRGB" in profile[:4096]:
@@ -61,13 +60,11 @@ def decode_picture(data: bytes, path: str, *, is_srgb: bool) -> Array:
     Raises OSError, ValueError, SyntaxError, EOFError, FileFormatError: it is no picture, damaged
     or too large.
     """
-    from advsearch.scene.importing.pictures import area_average, display_image  # late: with scipy
-
     if data.startswith((EXR, RADIANCE)):
         texels = _decode_radiance(data, path)
     else:
-        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-            check_decodable(image, path)
+        with Image.open(io.BytesIO(data), formats=reading.FORMATS) as image:
+            reading.check_decodable(image, path)
             if image.mode == "F" or image.mode.startswith("I"):
                 grey = np.nan_to_num(np.asarray(image, np.float32))
                 grey = grey if image.mode == "F" else grey / np.float32(65535.0)
@@ -75,25 +72,27 @@ def decode_picture(data: bytes, path: str, *, is_srgb: bool) -> Array:
             elif _is_png_of_16_bits(data):
                 texels = _decode_png_of_16_bits(data, image.size)
             else:
-                texels = display_image(image, LONGEST_SIDE if is_srgb else None, path, alpha=True, raw=not is_srgb)
+                texels = reading.pictures.display_image(
+                    image, LONGEST_SIDE if is_srgb else None, path, alpha=True, raw=not is_srgb
+                )
     if is_srgb:
-        texels = np.concatenate([srgb_to_linear(texels[:, :, :3]), texels[:, :, 3:]], axis=2)
+        texels = np.concatenate([color.srgb_to_linear(texels[:, :, :3]), texels[:, :, 3:]], axis=2)
     height, width = texels.shape[:2]
     shrink = LONGEST_SIDE / max(height, width)
     if shrink >= 1.0:
         return np.asarray(texels, np.float32)
-    return area_average(texels.astype(np.float32), max(1, round(height * shrink)), max(1, round(width * shrink)))
+    return reading.pictures.area_average(
+        texels.astype(np.float32), max(1, round(height * shrink)), max(1, round(width * shrink))
+    )
 
 
 def _decode_radiance(data: bytes, path: str) -> Array:
-    from advsearch.scene.importing.hdr import linear, read_exr, read_radiance  # late: with OpenEXR
-
     if data.startswith(EXR):
-        planes, _ = read_exr(Path(path), data)
+        planes, _ = reading.hdr.read_exr(Path(path), data)
         colors = np.stack([np.asarray(plane, np.float32) for plane in planes], axis=2)
     else:
-        pixels, scale, _ = read_radiance(Path(path), data)
-        colors = linear(pixels) * scale
+        pixels, scale, _ = reading.hdr.read_radiance(Path(path), data)
+        colors = reading.hdr.linear(pixels) * scale
     colors = np.nan_to_num(colors)
     return np.concatenate([colors, np.ones_like(colors[:, :, :1])], axis=2)
 

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.cli.output import at_work
-from advsearch.runs.exporters import Exported, Exporter
+from advsearch.extend import Exported, Exporter, Progress
 
 
 class Gltf(Exporter):
@@ -18,11 +17,10 @@ class Gltf(Exporter):
     example = "export mug-texture-001 --format gltf --out mug.glb"
     suffix = "glb"
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any]) -> Exported:
-        with at_work(as_json=True, quiet=False):
-            from advsearch.api.export import write_gltf  # takes seconds
+    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+        from advsearch.cli.exporters.scene.files import write_gltf  # takes seconds
 
-            notes = write_gltf(run, out)
+        notes = write_gltf(run, out)
         return Exported({"notes": notes}, " ".join([f"The object is in {out}.", *notes]))
 
 
@@ -34,9 +32,8 @@ class MitsubaScene(Exporter):
     example = "export mug-texture-001 --format mitsuba --out folder"
     suffix = "xml"
 
-    def write(self, run: str, out: Path, options: Mapping[str, Any]) -> Exported:
-        with at_work(as_json=True, quiet=False):
-            from advsearch.api.export import write_mitsuba  # takes seconds
+    def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+        from advsearch.cli.exporters.scene.files import write_mitsuba  # takes seconds
 
-            notes = write_mitsuba(run, out)
+        notes = write_mitsuba(run, out)
         return Exported({"notes": notes}, " ".join([f"The scene is in {out}.", *notes]))

@@ -15,10 +15,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Choice, Control, Parameter, Value, Values, color_of, measure, number
-from advsearch.controls.projector import LUMENS, TIMES, ProjectorControl
-from advsearch.controls.ranges import Number
-from advsearch.scene.settings import LIT, colors
+from advsearch.controls.projector.projector import LUMENS, TIMES, ProjectorControl
+from advsearch.extend import Choice, Control, Parameter, Value, Values, color
 
 OF_THE_SOURCE = ("azimuth", "elevation", "distance", "ambient", "flicker", "phase")
 WIDTH = 0.3  # object sizes
@@ -26,7 +24,7 @@ WIDTH_OF_ONE = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Diameter in which half of a round Gaussian of standard deviation 1 lies."""
 
 
-_lit = partial(number, LIT)
+_lit = partial(Parameter.number, Parameter.LIT)
 
 
 class SpotControl(ProjectorControl):
@@ -40,7 +38,7 @@ class SpotControl(ProjectorControl):
         _lit("y", "object sizes", -10.0, 10.0, 0.0, "Shift of its middle upwards.", (-0.5, 0.5)),
         _lit("width", "object sizes", 0.02, 10.0, WIDTH, "Diameter in which half of its light falls.", (0.05, 0.6),
              log=True),
-        *colors("of its light.", (0.0, 1.0)),
+        *Parameter.colors("of its light.", (0.0, 1.0)),
         _lit("lumens", "lumens", 0.0, 1e6, "0, or what is 20 times as bright as the place", "All of its light.",
              (0.0, LUMENS)),
         *(parameter for parameter in ProjectorControl.parameters if parameter.name in OF_THE_SOURCE),
@@ -66,7 +64,7 @@ class SpotControl(ProjectorControl):
             parameter, search=(0.0, bright), default=bright if self.asked and not self.searches("lumens") else 0.0
         )
 
-    def unchanged(self, parameter: Parameter) -> Number:
+    def unchanged(self, parameter: Parameter) -> float | str:
         return 0.0  # of the lumens; see `amount`
 
     def thrown(self, values: Values) -> Tensor:
@@ -76,11 +74,13 @@ class SpotControl(ProjectorControl):
         deviation = values["width"] / WIDTH_OF_ONE
         away = (across[None] - values["x"]) ** 2 + (-up[:, None] - values["y"]) ** 2
         spot = torch.exp(-0.5 * away / deviation**2) * (2.0 * half) ** 2 / (2.0 * math.pi * deviation**2)
-        return spot[..., None] * color_of(values)
+        return spot[..., None] * color.combine_channels(values)
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         brightest = float(self.thrown(values).detach().max())
         return {
-            "lux": measure(brightest * float(self._lux(values)), "lux, where it is brightest"),
-            "beside_ambient": measure(brightest * float(self._beside(values)), "times the ambient light"),
+            "lux": Value(value=float(brightest * float(self._lux(values))), unit="lux, where it is brightest"),
+            "beside_ambient": Value(
+                value=float(brightest * float(self._beside(values))), unit="times the ambient light"
+            ),
         }

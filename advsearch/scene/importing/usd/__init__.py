@@ -11,12 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import damaged, looks_like, shown
-from advsearch.trust import stored_files
-from advsearch.trust.code import OWN_FOLDER
-from advsearch.trust.programs import run_converter
-from advsearch.trust.stored_files import LARGEST_FILE, scaled
+from advsearch.extend import FileFormatError, reading, stored_files
 
 PACKAGE = ".usdz"
 LAYERS = (".usd", ".usda", ".usdc")
@@ -29,12 +24,12 @@ import runpy, sys
 try:
     import resource
     resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[1]),) * 2)
-    resource.setrlimit(resource.RLIMIT_FSIZE, ({LARGEST_FILE} * 4,) * 2)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ({stored_files.LARGEST_FILE} * 4,) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 except ImportError:
     pass
 del sys.argv[1]
-runpy.run_module("advsearch.scene.importing.usd_stage", run_name="__main__", alter_sys=True)
+runpy.run_module("advsearch.scene.importing.usd.stage", run_name="__main__", alter_sys=True)
 """
 
 
@@ -46,7 +41,7 @@ def convert_usd(path: Path, data: bytes) -> bytes:
     """Return an OpenUSD file as binary glTF. Raises FileFormatError: it is none, names what lies outside its folder, is
     too large, or `usd-core` is missing."""
     if not data.startswith(USD_BEGINNINGS):
-        raise damaged(path, "an OpenUSD file", looks_like(data))
+        raise reading.damaged(path, "an OpenUSD file", reading.looks_like(data))
     if not is_installed():
         raise FileFormatError(
             f"{path}: an OpenUSD file needs usd-core, which is not installed: pip install 'advsearch[usd]'; or export "
@@ -55,17 +50,19 @@ def convert_usd(path: Path, data: bytes) -> bytes:
     with tempfile.TemporaryDirectory(prefix="advsearch-usd-") as folder:
         target, inside = Path(folder) / "scene.glb", Path(folder) / "package"
         inside.mkdir()
-        names = [str(scaled(MEMORY)), str(path.resolve()), str(target), str(inside)]
+        names = [str(stored_files.scaled(MEMORY)), str(path.resolve()), str(target), str(inside)]
         program = [sys.executable, "-W", "ignore", "-c", _LIMITED, *names]
-        done = run_converter(path, "usd-core", program, folder=OWN_FOLDER, seconds=USD_LONGEST, env=None)
+        done = reading.run_converter(
+            path, "usd-core", program, folder=reading.OWN_FOLDER, seconds=USD_LONGEST, env=None
+        )
         if done.returncode or not target.is_file():
             lines = [line for line in done.stderr.splitlines() if line.strip()] or ["without a word"]
             last = lines[-1]
             if last.startswith(REFUSED):
                 text = last.removeprefix(REFUSED)
                 raise FileFormatError(f"{path.parent / text}" if text.startswith(path.name) else f"{path}: {text}")
-            crashed = f"signal {-done.returncode}" if done.returncode < 0 else shown(last.strip(), quoted=False)
+            crashed = f"signal {-done.returncode}" if done.returncode < 0 else reading.shown(last.strip(), quoted=False)
             raise FileFormatError(f"{path}: usd-core could not read it ({crashed}); export or download it again")
         for name in json.loads(done.stdout.splitlines()[-1]):
             stored_files.note_opened(name)
-        return stored_files.read_bytes(target, "a glTF file", 4 * LARGEST_FILE)
+        return stored_files.read_bytes(target, "a glTF file", 4 * stored_files.LARGEST_FILE)

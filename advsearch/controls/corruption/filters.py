@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw
 from scipy import ndimage
 from torch import Tensor
 
-from advsearch import seeds
+from advsearch.extend import images, seeds
 
 REFERENCE = 224  # smaller side in pixels of the pictures that the published tables were made for
 LEVELS = 5  # severities run from 1 to this
@@ -58,16 +58,6 @@ def between(level: Tensor, make: Callable[[int], Tensor]) -> Tensor:
     return low + share * (high - low)
 
 
-def planes(image: Tensor) -> Tensor:
-    """(H, W, C) to (1, C, H, W)."""
-    return image.permute(2, 0, 1)[None]
-
-
-def picture(stack: Tensor) -> Tensor:
-    """(1, C, H, W) to (H, W, C)."""
-    return stack[0].permute(1, 2, 0)
-
-
 def blurred(image: Tensor, sigma: Tensor) -> Tensor:
     """Blur an (H, W, C) picture with a Gaussian of () standard deviation in pixels; edges are continued."""
     reach = max(1, math.ceil(4.0 * float(sigma.detach())))
@@ -75,9 +65,9 @@ def blurred(image: Tensor, sigma: Tensor) -> Tensor:
     weights = torch.exp(-0.5 * (offsets / sigma) ** 2)
     weights = weights / weights.sum()
     channels = image.shape[2]
-    padded = F.pad(planes(image), (reach,) * 4, mode="replicate")
+    padded = F.pad(images.planes(image), (reach,) * 4, mode="replicate")
     rows = F.conv2d(padded, weights.view(1, 1, -1, 1).expand(channels, 1, -1, 1), groups=channels)
-    return picture(F.conv2d(rows, weights.view(1, 1, 1, -1).expand(channels, 1, 1, -1), groups=channels))
+    return images.picture(F.conv2d(rows, weights.view(1, 1, 1, -1).expand(channels, 1, 1, -1), groups=channels))
 
 
 def streaked(image: Tensor, radius: Tensor, sigma: Tensor, angle: float, step: float) -> Tensor:
@@ -91,32 +81,13 @@ def streaked(image: Tensor, radius: Tensor, sigma: Tensor, angle: float, step: f
     weights = torch.exp(-0.5 * (along / sigma) ** 2) * (2.0 * radius + 1.0 - along).clamp(0.0, 1.0)
     weights = weights / weights.sum()
     height, width = image.shape[:2]
-    padded = F.pad(planes(image), (count,) * 4, mode="replicate")
+    padded = F.pad(images.planes(image), (count,) * 4, mode="replicate")
     total = torch.zeros_like(image)
     for number, weight in enumerate(weights):
         down, across = round(number * math.sin(angle)), round(number * math.cos(angle))
         moved = padded[:, :, count + down : count + down + height, count + across : count + across + width]
-        total = total + weight * picture(moved)
+        total = total + weight * images.picture(moved)
     return total
-
-
-def warped(image: Tensor, shift: Tensor) -> Tensor:
-    """Look every pixel of an image (H, W, C) up at another place: `shift` (H, W, 2) pixels to the right and down;
-    places outside are mirrored inwards."""
-    height, width = image.shape[:2]
-    rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    where = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(image.device)
-    grid = where * torch.tensor([2.0 / width, 2.0 / height], device=image.device) - 1.0
-    return picture(F.grid_sample(planes(image), grid[None], padding_mode="reflection", align_corners=False))
-
-
-def resized(field: Tensor, height: int, width: int, *, antialias: bool = True) -> Tensor:
-    """Resize an (h, w, C) field to (height, width, C), bilinearly; differentiable."""
-    if field.shape[:2] == (height, width):
-        return field
-    size = (height, width)
-    stack = F.interpolate(planes(field), size, mode="bilinear", antialias=antialias, align_corners=False)
-    return picture(stack).contiguous()
 
 
 GAUSSIAN = ((0.08,), (0.12,), (0.18,), (0.26,), (0.38,))  # standard deviation, sRGB
@@ -126,15 +97,8 @@ SPECKLE = ((0.15,), (0.2,), (0.35,), (0.45,), (0.6,))  # standard deviation rela
 _DARK = 1e-3  # keeps the slope of a square root finite in black
 
 
-@lru_cache(maxsize=8)
-def drawn(height: int, width: int, seed: int, stream: str, *, normal: bool = True) -> Tensor:
-    """Return the noise (height, width, 3) of a stream of random numbers: standard normal, or uniform in [0, 1)."""
-    source = torch.Generator().manual_seed(seeds.stream(seed, stream))
-    return (torch.randn if normal else torch.rand)(height, width, 3, generator=source)
-
-
 def _noise(image: Tensor, seed: int, name: str, *, normal: bool = True) -> Tensor:
-    return drawn(image.shape[0], image.shape[1], seed, f"corruption {name}", normal=normal).to(image.device)
+    return images.drawn(image.shape[0], image.shape[1], seed, f"corruption {name}", normal=normal).to(image.device)
 
 
 def gaussian_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
@@ -218,11 +182,11 @@ def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     distance = torch.sqrt(offsets[:, None] ** 2 + offsets[None, :] ** 2)
     disc = (radius + 0.5 - distance).clamp(0.0, 1.0)
     height, width = image.shape[:2]
-    padded = F.pad(planes(image), (reach,) * 4, mode="replicate")
+    padded = F.pad(images.planes(image), (reach,) * 4, mode="replicate")
     size = (padded.shape[2] + 2 * reach, padded.shape[3] + 2 * reach)
     product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(disc / disc.sum(), s=size)
     whole = torch.fft.irfft2(product, s=size)
-    return picture(whole[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width])
+    return images.picture(whole[:, :, 2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width])
 
 
 def motion_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
@@ -240,7 +204,7 @@ def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     theta = torch.cat([matrices, matrices.new_zeros(ZOOM_STEPS, 2, 1)], dim=2).to(image.device)
     height, width = image.shape[:2]
     grid = F.affine_grid(theta, [ZOOM_STEPS, 3, height, width], align_corners=False)
-    copies = planes(image).expand(ZOOM_STEPS, -1, -1, -1)
+    copies = images.planes(image).expand(ZOOM_STEPS, -1, -1, -1)
     zoomed = F.grid_sample(copies, grid, padding_mode="border", align_corners=False)
     return (image + zoomed.sum(dim=0).permute(1, 2, 0)) / (ZOOM_STEPS + 1)
 
@@ -249,7 +213,7 @@ def glass_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Look through frosted glass: blur, show at each pixel what a neighbour shows, blur again."""
     sigma = at_level(GLASS, level)[0] * scale(image)
     shift = between(level, lambda whole: _glass_shift(image.shape[0], image.shape[1], seed, whole))
-    return blurred(warped(blurred(image, sigma), shift * scale(image)), sigma)
+    return blurred(images.warped(blurred(image, sigma), shift * scale(image)), sigma)
 
 
 @lru_cache(maxsize=8)
@@ -270,7 +234,7 @@ def _glass_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
     came, place_of = torch.tensor(shown), torch.arange(tall * wide)
     across, down = came % wide - place_of % wide, came // wide - place_of // wide
     shift = torch.stack([across, down]).view(1, 2, tall, wide).float()
-    return picture(F.interpolate(shift, (height, width), mode="nearest-exact"))
+    return images.picture(F.interpolate(shift, (height, width), mode="nearest-exact"))
 
 
 def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
@@ -280,7 +244,7 @@ def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
         shift = severity * _elastic_shift(height, width, seed, 1).to(severity.device)
     else:
         shift = between(severity, lambda whole: _elastic_shift(height, width, seed, whole))
-    return warped(image, scale(image) * shift)
+    return images.warped(image, scale(image) * shift)
 
 
 @lru_cache(maxsize=8)
@@ -299,7 +263,7 @@ def _elastic_shift(height: int, width: int, seed: int, whole: int) -> Tensor:
     columns = torch.arange(wide)[None, :, None] - (wide - 1) / 2.0
     shear = (corners[0] + corners[2]) / 2.0 + rows * by_row + columns * by_column
     shift = torch.from_numpy(waves) * wrinkle + shear
-    return resized(shift, height, width)
+    return images.resized(shift, height, width)
 
 
 FOG = ((1.5,), (2.0,), (2.5,), (2.5,), (3.0,))  # how dense the fog is
@@ -332,7 +296,7 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
 def _drift(height: int, width: int, seed: int, decay: float) -> Tensor:
     """(H, W, 1) fog in [0, 1]."""
     tall, wide = reference_size(height, width)
-    return resized(fractal(max(tall, wide), decay, generator(seed, "fog"))[:tall, :wide, None], height, width)
+    return images.resized(fractal(max(tall, wide), decay, generator(seed, "fog"))[:tall, :wide, None], height, width)
 
 
 def fractal(side: int, decay: float, source: torch.Generator) -> Tensor:
@@ -368,9 +332,9 @@ def _crystals(height: int, width: int, seed: int) -> Tensor:
     tall, wide = reference_size(height, width)
     source = generator(seed, "frost")
     film = fractal(max(tall, wide), 1.4, source)[:tall, :wide, None]
-    feathers = resized(_feathers(2 * tall, 2 * wide, source), tall, wide)
+    feathers = images.resized(_feathers(2 * tall, 2 * wide, source), tall, wide)
     ice = 0.2 + 0.3 * film + (0.45 + 0.75 * film) * feathers
-    return resized((ice * torch.tensor(ICE)).clamp(0.0, 1.0), height, width)
+    return images.resized((ice * torch.tensor(ICE)).clamp(0.0, 1.0), height, width)
 
 
 def _feathers(height: int, width: int, source: torch.Generator) -> Tensor:
@@ -411,7 +375,7 @@ def _snowfall(height: int, width: int, seed: int, whole: int) -> Tensor:
     source = generator(seed, "snow")
     angle = math.radians(-135.0 + 90.0 * float(torch.rand((), generator=source)))
     noise = mean + spread * torch.randn(math.ceil(tall / flake), math.ceil(wide / flake), 1, generator=source)
-    flakes = resized(noise, tall, wide)
+    flakes = images.resized(noise, tall, wide)
     flakes = torch.where(flakes < over, torch.zeros_like(flakes), flakes)
     streaks = streaked(flakes, torch.tensor(radius), torch.tensor(sigma), angle, 1.0)
-    return resized(streaks.clamp(0.0, 1.0), height, width)
+    return images.resized(streaks.clamp(0.0, 1.0), height, width)

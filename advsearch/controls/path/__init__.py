@@ -22,16 +22,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from advsearch.controls.base import WAY, Choice, Control, Parameter, Value, Values, measure, named
-from advsearch.controls.ranges import OneOf, Spec, is_number
-from advsearch.controls.support.rotations import euler
-from advsearch.errors import FileFormatError, InputError
-from advsearch.files import PATH_ENDINGS
-from advsearch.options import rounded
-from advsearch.scene.assets import Doubles
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import affine, camera_to_world, middle, object_to_world
-from advsearch.scene.pose_files import (
+from advsearch.controls.path.pose_files import (
     AXES_MEAN,
     KITTI_RATE,
     OPTICAL,
@@ -41,13 +32,27 @@ from advsearch.scene.pose_files import (
     Trajectory,
     read_trajectory,
 )
-from advsearch.scene.settings import GEOMETRIC, ORBIT, ORBIT_CAMERA, moving
-from advsearch.scene.skeleton import entries_of_turn
-from advsearch.trust.stored_files import read_text
+from advsearch.extend import (
+    Choice,
+    Control,
+    FileFormatError,
+    Fixed,
+    InputError,
+    OneOf,
+    Parameter,
+    Range,
+    SceneDescription,
+    Value,
+    Values,
+    geometry,
+    parts,
+    stored_files,
+)
 
 APPROACH, PASS, TURN = "approach", "pass", "orbit"
 PATHS = (APPROACH, PASS, TURN)
 CAMERA, THING = MOVERS = "camera", "object"
+PATH_ENDINGS = (".csv", ".txt", ".tum", ".kitti")  # of files with a path, in small letters
 BOTH = "+"  # between the camera's path and the object's
 SEVERAL = ","  # between paths of which one is drawn
 MOST_PATHS = 64
@@ -93,7 +98,7 @@ class Waypoints:
         assert self.rotations is not None
         quaternion = self.at(time, self.rotations)
         quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-        entries = torch.stack(entries_of_turn(*quaternion.unbind(dim=-1)), dim=-1)
+        entries = torch.stack(geometry.entries_of_turn(*quaternion.unbind(dim=-1)), dim=-1)
         return entries.reshape(*entries.shape[:-1], 3, 3)
 
 
@@ -116,7 +121,9 @@ class PathControl(Control):
     kind = "path"
     travels = True
     parameters = (
-        moving(ORBIT, "time", "s", 0.0, LONGEST, "where the scene is as it is", "Time since the path began."),
+        Parameter.moving(
+            Parameter.ORBIT, "time", "s", 0.0, LONGEST, "where the scene is as it is", "Time since the path began."
+        ),
     )
     choices = (
         Choice("path", APPROACH,
@@ -148,7 +155,7 @@ class PathControl(Control):
         names = _names(settings.get("path", APPROACH)) if isinstance(settings, Mapping) else ()
         if len(names) < 2:
             return cls.parameters
-        return *cls.parameters, named(WAY, names, names[0], "Which of the paths.")
+        return *cls.parameters, Parameter.named(Control.WAY, names, names[0], "Which of the paths.")
 
     def check_choices(self) -> None:
         names = _names(self.chosen["path"])
@@ -200,7 +207,7 @@ class PathControl(Control):
         if given is None:
             return
         fits = isinstance(given, list | tuple) and len(given) == 3
-        if not fits or not all(is_number(value) and math.isfinite(value) for value in given):
+        if not fits or not all(Parameter.is_number(value) and math.isfinite(value) for value in given):
             raise InputError(f"{self.name}.object_at: expected three numbers as in [20, 0, 0], got {given!r}")
 
     def _read_file(self, path: Path, mover: str, alone: bool) -> Ways:
@@ -226,7 +233,7 @@ class PathControl(Control):
             if "seconds" in self._given:
                 seconds = float(self.chosen["seconds"])
             else:
-                assumed["seconds"] = f"{KITTI_RATE:g} poses a second, {rounded(seconds)} in all"
+                assumed["seconds"] = f"{KITTI_RATE:g} poses a second, {_round_text(seconds)} in all"
             times = np.linspace(0.0, seconds, count)
         check_times(path, times)
 
@@ -273,8 +280,8 @@ class PathControl(Control):
             notes=tuple(notes),
         )
 
-    def spec(self, parameter: Parameter) -> Spec:
-        if parameter.name == WAY and WAY not in self.specs:  # whatever else is asked for
+    def spec(self, parameter: Parameter) -> Fixed | Range | OneOf:
+        if parameter.name == Control.WAY and Control.WAY not in self.specs:  # whatever else is asked for
             return OneOf(parameter.options)
         return super().spec(parameter)
 
@@ -291,10 +298,10 @@ class PathControl(Control):
         return then
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        if CAMERA in self._movers and scene.camera != ORBIT_CAMERA:
+        if CAMERA in self._movers and not scene.is_seen_from_orbit:
             raise InputError(
                 f"`controls` {self.name}: moves the camera, and the scene is seen by its camera {scene.camera!r}; give "
-                f"moves=object, or have it seen by {ORBIT_CAMERA!r}"
+                f"moves=object, or have it seen by 'orbit'"
             )
         self._check_needless()
         there = self.within(scene)
@@ -305,8 +312,8 @@ class PathControl(Control):
         shortest = min((float(one.times[-1]) for one in self._files), default=self.seconds)
         if len(self._paths) > 1 and shortest < self.seconds:
             notes.append(
-                f"path: the shortest of the files takes {rounded(shortest)} s of {rounded(self.seconds)}; who has "
-                "arrived waits, and these frames count"
+                f"path: the shortest of the files takes {_round_text(shortest)} s of {_round_text(self.seconds)}; who "
+                "has arrived waits, and these frames count"
             )
         return replace(scene, remarks=tuple(dict.fromkeys((*scene.remarks, *notes)))) if notes else scene
 
@@ -330,12 +337,12 @@ class PathControl(Control):
             )
 
     def in_scene(self, parameter: Parameter) -> Parameter:
-        if parameter.name == WAY:
+        if parameter.name == Control.WAY:
             return parameter
         first, *last = self._paths[0].values()
         way = last[0] if last and first == TURN else first  # who goes around is back at the end
         clean = CLEAN_AT.get(way, 0.0) * self.seconds if isinstance(way, str) else 0.0
-        estimators = ORBIT if CAMERA in self._movers else GEOMETRIC
+        estimators = Parameter.ORBIT if CAMERA in self._movers else Parameter.GEOMETRIC
         return replace(parameter, default=clean, search=(0.0, self.seconds), estimators=estimators)
 
     def scene_inputs(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -357,7 +364,7 @@ class PathControl(Control):
 
     def measured(self, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         unit = "object sizes" if self.scene.object.metres is None else "metres"
-        return {"distance": measure(float(self._distance(self._ways(values), values["time"])), unit)}
+        return {"distance": Value(value=float(self._distance(self._ways(values), values["time"])), unit=unit)}
 
     def distances(self, times: Tensor) -> Tensor:
         """Return the distances (ways, n) of the camera from the object on each of the paths at times (n,), in the unit
@@ -372,7 +379,7 @@ class PathControl(Control):
         return distance
 
     def _ways(self, values: Values) -> Ways:
-        return self._paths[int(values[WAY])] if WAY in values else self._paths[0]
+        return self._paths[int(values[Control.WAY])] if Control.WAY in values else self._paths[0]
 
     def _camera(self, ways: Ways, begin: Start, time: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Where the camera is, and what it looks at: an object that is shifted, unless a file says something else."""
@@ -418,7 +425,7 @@ class PathControl(Control):
 @lru_cache(maxsize=4)
 def start_of(scene: SceneDescription, device: torch.device) -> Start:
     """Return how a scene stands; kept in memory, as it takes a look at every vertex."""
-    poses = camera_to_world(scene), middle(scene), object_to_world(scene)
+    poses = geometry.camera_to_world(scene), geometry.middle(scene), geometry.object_to_world(scene)
     return Start(*(torch.from_numpy(pose).float().to(device) for pose in poses))
 
 
@@ -446,7 +453,7 @@ def pose_camera(place: Tensor, rotation: Tensor, roll: float) -> Tensor:
 
 def _rolled(place: Tensor, left: Tensor, up: Tensor, ahead: Tensor, roll: float) -> Tensor:
     cos, sin = math.cos(math.radians(roll)), math.sin(math.radians(roll))
-    return affine(torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1), place)
+    return geometry.affine(torch.stack([cos * left + sin * up, cos * up - sin * left, ahead], dim=1), place)
 
 
 def measure_tilt(rotations: Rotation) -> float:
@@ -455,14 +462,14 @@ def measure_tilt(rotations: Rotation) -> float:
     return math.degrees(math.acos(float(np.clip(upwards.mean(), -1.0, 1.0))))
 
 
-def align_quaternions(quaternions: Doubles) -> Doubles:
+def align_quaternions(quaternions: parts.Doubles) -> parts.Doubles:
     """Return quaternions (n, 4) with signs such that each is nearer to the one before than its opposite is."""
     turns_back = (quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0.0
     signs = np.where(np.cumsum(np.concatenate([[False], turns_back])) % 2, -1.0, 1.0)
     return np.asarray(quaternions * signs[:, None])
 
 
-def check_times(path: Path, times: Doubles) -> None:
+def check_times(path: Path, times: parts.Doubles) -> None:
     """Raise FileFormatError: times (n,) from the first on are too few or many, or do not ascend within limits."""
     if not 2 <= len(times) <= MOST_WAYPOINTS:
         raise FileFormatError(f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(times)}")
@@ -474,12 +481,12 @@ def check_times(path: Path, times: Doubles) -> None:
 
 def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
     """Return what turns the object about the vertical through its middle, in degrees, and shifts it: (4, 4)."""
-    about, center = euler(heading, *heading.new_zeros(2)), start.middle
-    posed: Tensor = affine(about, center - about @ center + shift) @ start.object
+    about, center = geometry.euler(heading, *heading.new_zeros(2)), start.middle
+    posed: Tensor = geometry.affine(about, center - about @ center + shift) @ start.object
     return posed
 
 
-def the_shorter_way(degrees: Doubles) -> tuple[Doubles, str | None]:
+def the_shorter_way(degrees: parts.Doubles) -> tuple[parts.Doubles, str | None]:
     """Return headings (n,) so that one goes to the next the shorter way round, and what is said of it.
 
     Only where all are within one turn, from 0 to 360 or from -180 to 180: others count on, as 0 to 360 does for a whole
@@ -495,6 +502,11 @@ def the_shorter_way(degrees: Doubles) -> tuple[Doubles, str | None]:
     return np.asarray(np.unwrap(degrees, period=360.0)), note
 
 
+def _round_text(number: float) -> str:
+    """Return a number with three significant digits, for a sentence."""
+    return f"{float(f'{number:.3g}'):g}"
+
+
 def _names(path: object) -> tuple[str, ...]:
     """The paths in a list, or in a text with commas between them."""
     return tuple(str(one).strip() for one in (path if isinstance(path, list | tuple) else str(path).split(SEVERAL)))
@@ -506,7 +518,7 @@ def _is_path(name: str) -> bool:
 
 def _read_text(path: Path) -> str:
     try:
-        return read_text(path, "a table of waypoints", MOST_BYTES).removeprefix("\ufeff")
+        return stored_files.read_text(path, "a table of waypoints", MOST_BYTES).removeprefix("\ufeff")
     except OSError as error:
         raise FileFormatError(f"{path}: expected a table of waypoints, got {error.strerror}") from error
 

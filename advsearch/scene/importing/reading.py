@@ -1,0 +1,55 @@
+"""What readers of mesh files and converters to glTF are made of: parts, glTF, messages, bounds, other programs."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from advsearch.pictures import FORMATS as FORMATS
+from advsearch.pictures import check_decodable as check_decodable
+from advsearch.scene.assets import face_vectors as face_vectors
+from advsearch.scene.glb import PLAIN as PLAIN
+from advsearch.scene.glb import GlbBuffer as GlbBuffer
+from advsearch.scene.glb import glb as glb
+from advsearch.scene.glb import mime_type as mime_type
+from advsearch.scene.importing.files import SPLATS as SPLATS
+from advsearch.scene.importing.files import Notes as Notes
+from advsearch.scene.importing.files import check_faces as check_faces
+from advsearch.scene.importing.files import damaged as damaged
+from advsearch.scene.importing.files import is_number as is_number
+from advsearch.scene.importing.files import last_line as last_line
+from advsearch.scene.importing.files import looks_like as looks_like
+from advsearch.scene.importing.files import read_bytes as read_bytes
+from advsearch.scene.importing.files import shown as shown
+from advsearch.scene.importing.geometry import triangulated as triangulated
+from advsearch.scene.importing.parts import ImportedPart as ImportedPart
+from advsearch.scene.importing.parts import holds_normals as holds_normals
+from advsearch.scene.importing.unread import TrackedKeys as TrackedKeys
+from advsearch.scene.importing.unread import join_names as join_names
+from advsearch.trust.code import OWN_FOLDER as OWN_FOLDER
+from advsearch.trust.named_files import MISSING as MISSING
+from advsearch.trust.named_files import OUTSIDE as OUTSIDE
+from advsearch.trust.named_files import is_inside as is_inside
+from advsearch.trust.programs import find_blender as find_blender
+from advsearch.trust.programs import run_converter as run_converter
+from advsearch.trust.programs import surroundings as surroundings
+
+if TYPE_CHECKING:
+    from advsearch.scene.importing import gltf_entries as gltf_entries
+    from advsearch.scene.importing import hdr as hdr
+    from advsearch.scene.importing import pictures as pictures
+    from advsearch.scene.importing.gltf import DEEPEST_TREE as DEEPEST_TREE
+    from advsearch.scene.importing.gltf import LARGEST_TREE as LARGEST_TREE
+
+_LATE = {"DEEPEST_TREE": "gltf", "LARGEST_TREE": "gltf"}
+_LATE_MODULES = ("gltf_entries", "hdr", "pictures")
+"""Only some need these, and they import pydantic, scipy or OpenEXR."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name on first use (PEP 562)."""
+    if name in _LATE_MODULES:
+        return import_module(f"advsearch.scene.importing.{name}")
+    if name in _LATE:
+        return getattr(import_module(f"advsearch.scene.importing.{_LATE[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
