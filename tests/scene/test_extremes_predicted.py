@@ -97,7 +97,7 @@ def test_changes_are_predicted(name: str, holds: str, data: dict[str, Any]) -> N
 
 def test_a_texture_behind_glass_is_predicted() -> None:
     """Changes of a texture behind clear glass are predicted texel by texel."""
-    right(predicted({"texture": {"resolution": 32}}, parts=[glass()]))
+    right(predicted({"texture": {"resolution": 32}}, plugins=glass()))
 
 
 def test_a_lamp_that_goes_out_is_predicted() -> None:
@@ -220,7 +220,7 @@ def test_a_mirror_is_too_far_off_and_the_comparison_says_so() -> None:
 
 def test_what_stands_behind_glass_is_refused() -> None:
     """An object behind clear glass is refused in words."""
-    reason = why_not(small(PAINTED, parts=[glass()]), ["camera"])
+    reason = why_not(small(PAINTED, plugins=glass()), ["camera"])
     checks = [
         holds("it says that there is more in the scene", reason is not None and "more in the scene" in reason.text),
         holds("without the glass it is not refused", why_not(small(PAINTED, denoise="oidn"), ["camera"]) is None),
