@@ -6,14 +6,11 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from advsearch.interrupts import interruptible
 from advsearch.runs.results import INTERRUPTED, OUT_OF_TIME, Fields, Result
 from advsearch.runs.summary import NAME, stored_result
-
-if TYPE_CHECKING:
-    from advsearch.experiment import RunContext
 
 Row = TypeVar("Row")
 AnyFields = TypeVar("AnyFields", bound=Fields)
@@ -33,11 +30,11 @@ class Measurements:
         made: how many were made in this sitting.
 
     Args:
-        context: of the run that stores them.
+        context: `experiment.RunContext` of the run that stores them.
         seconds: from now on, after which none is begun; None for no limit.
     """
 
-    def __init__(self, context: RunContext[Any], seconds: float | None = None) -> None:
+    def __init__(self, context: Any, seconds: float | None = None) -> None:
         self._context = context
         self._store = context.run.store
         self._end = math.inf if seconds is None else time.monotonic() + seconds

@@ -162,7 +162,7 @@ def test_what_is_stored_is_not_measured_again(tmp_path: Path) -> None:
 
 
 def test_a_finished_part_is_not_even_loaded(whole: CheckResult, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checking.workbench, "problem_from_config", lambda *_, **__: pytest.fail("loaded"))
+    monkeypatch.setattr("advsearch.api.workbench.problem_from_config", lambda *_, **__: pytest.fail("loaded"))
     begun = time.process_time()
     again = check.run(CheckConfig(**SMALL, run=whole.run), resumed=Path(str(whole.run)))
     assert values(again) == values(whole) and time.process_time() - begun < 20.0

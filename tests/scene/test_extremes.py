@@ -14,7 +14,7 @@ import torch
 from advsearch import load_scene, threads
 from advsearch.engine.gradients import smooth_loss
 from advsearch.errors import InputError
-from advsearch.questions.stability.scene import shown, small
+from advsearch.questions.stability.scene import make_renderer, render_image
 from advsearch.scene.assets import EnvironmentAsset
 
 SIZE = 24
@@ -116,9 +116,9 @@ def rendered(path: str, count: int) -> None:
     """
     threads.configure(count)
     loss = smooth_loss((SIZE, SIZE))
-    raw, denoised = small({"texture": {"resolution": 16}}), small(SHIFT, denoise="oidn")
-    arrays = {"raw": shown(raw, raw.start, 0, 8), "denoised": shown(denoised, denoised.start, 0, 8)}
-    arrays["moved"] = torch.stack([shown(denoised, place[None], 0, 8) for place in torch.linspace(0.1, 0.9, 40)])
+    raw, denoised = make_renderer({"texture": {"resolution": 16}}), make_renderer(SHIFT, denoise="oidn")
+    arrays = {"raw": render_image(raw, raw.start, 0, 8), "denoised": render_image(denoised, denoised.start, 0, 8)}
+    arrays["moved"] = torch.stack([render_image(denoised, place[None], 0, 8) for place in torch.linspace(0.1, 0.9, 40)])
     arrays["adjoint"], arrays["again"] = (raw.gradient(loss, raw.start, 0, 8)[1] for _ in range(2))
     np.savez(path, allow_pickle=False, **{name: values.numpy() for name, values in arrays.items()})
 
@@ -126,10 +126,10 @@ def rendered(path: str, count: int) -> None:
 def changed_threads() -> None:
     """Render a scene again and again while the number of threads changes; run in a process of its own."""
     threads.configure(2)
-    renderer = small(SHIFT)
+    renderer = make_renderer(SHIFT)
     for count in (2, 1, 2, 1, 2, 1):
         threads.configure(count)
-        shown(renderer, renderer.start, 0, 8)
+        render_image(renderer, renderer.start, 0, 8)
 
 
 def in_a_process(call: str) -> None:

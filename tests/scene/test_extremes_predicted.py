@@ -15,13 +15,13 @@ from advsearch.questions.stability.scene import (
     REFERENCE_SPP,
     ControlSettings,
     Thing,
-    black_and_white,
-    grey_map,
-    inward,
-    shown,
-    small,
+    make_checkered_mug,
+    make_grey_map,
+    make_renderer,
+    measure_inward_slope,
+    render_image,
 )
-from advsearch.questions.stability.scenes import FLASH, TEXTURE, glass
+from advsearch.questions.stability.scenes import FLASH, TEXTURE, make_glass_ball
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.surface.renderer import SurfaceRenderer, why_not
 from advsearch.scene.transport.lights import BasisRenderer
@@ -32,7 +32,7 @@ TRACED = 256
 OFF = 0.15
 """Root mean square error of a predicted change, as a share of the change: noise of the matrix, and light that meets the
 texture twice."""
-NIGHT = grey_map(0.0)
+NIGHT = make_grey_map(0.0)
 
 
 def right(outcome: Outcome) -> None:
@@ -49,11 +49,11 @@ def predicted(
     **scene: object,
 ) -> Outcome:
     """Predict by a matrix how a picture changes where each number goes up or down by epsilon, by chance."""
-    renderer = small(controls, thing, **scene)  # type: ignore[arg-type]
+    renderer = make_renderer(controls, thing, **scene)  # type: ignore[arg-type]
     linear, start = LinearRenderer(renderer, renderer.start, seed=1), renderer.start
     signs = torch.randint(0, 2, start.shape, generator=torch.Generator().manual_seed(3)) * 2.0 - 1.0
     u = (start + epsilon * signs).clamp(0.0, 1.0)
-    traced = shown(renderer, u, 5, TRACED) - shown(renderer, start, 5, TRACED)
+    traced = render_image(renderer, u, 5, TRACED) - render_image(renderer, start, 5, TRACED)
     with torch.no_grad():
         change = linear(u) - linear(start)
     _, slope = linear.renderer.gradient(lambda picture: picture.square().mean(), u, 0, 1)
@@ -78,7 +78,7 @@ PREDICTED: list[tuple[str, str, dict[str, Any]]] = [
     ("predicted-epsilon-1", "Changes to white and black are predicted.",
      {"controls": {"texture": {"resolution": 8, "epsilon": 1.0}}, "epsilon": 1.0, "off": 0.3, "slow": True}),
     ("predicted-black-and-white", "Changes of a texture that is exactly 0 and 1 are predicted.",
-     {"thing": black_and_white, "epsilon": 0.2, "off": 0.3, "slow": True}),
+     {"thing": make_checkered_mug, "epsilon": 0.2, "off": 0.3, "slow": True}),
     ("predicted-mirror", "Changes of a mirror's tint are predicted.",
      {"settings": MIRROR, "off": 0.35, "slow": True}),
     ("predicted-out-of-sight", "A texture that nobody sees changes nothing.", {"settings": AWAY}),
@@ -97,16 +97,16 @@ def test_changes_are_predicted(name: str, holds: str, data: dict[str, Any]) -> N
 
 def test_a_texture_behind_glass_is_predicted() -> None:
     """Changes of a texture behind clear glass are predicted texel by texel."""
-    right(predicted({"texture": {"resolution": 32}}, parts=[glass()]))
+    right(predicted({"texture": {"resolution": 32}}, plugins=make_glass_ball()))
 
 
 def test_a_lamp_that_goes_out_is_predicted() -> None:
     """A lamp that goes out is predicted, to darkness."""
     lamp: ControlSettings = {"light": {"power": [0.0, 12.0]}}
     on, out = torch.ones(1), torch.zeros(1)
-    beside = small(lamp)
-    basis, alone = BasisRenderer(beside, on, seed=1), BasisRenderer(small(lamp, environment=NIGHT), on, seed=1)
-    traced = shown(beside, out, 5, TRACED) - shown(beside, on, 5, TRACED)
+    beside = make_renderer(lamp)
+    basis, alone = BasisRenderer(beside, on, seed=1), BasisRenderer(make_renderer(lamp, environment=NIGHT), on, seed=1)
+    traced = render_image(beside, out, 5, TRACED) - render_image(beside, on, 5, TRACED)
     with torch.no_grad():
         change, black = basis(out) - basis(on), alone(out)
     _, slope = alone.renderer.gradient(lambda picture: picture.square().mean(), out, 0, 1)
@@ -142,7 +142,7 @@ def lit(
         slope: relative error that the derivative may have, since light that meets the texture twice is left out of it;
             None where the picture does not depend on the texture, and it has to be 0.
     """
-    renderer = small(controls, thing, **scene)  # type: ignore[arg-type]
+    renderer = make_renderer(controls, thing, **scene)  # type: ignore[arg-type]
     light, u = SurfaceRenderer(renderer, renderer.start, seed=1), renderer.start
     with torch.no_grad():
         picture = light(u)
@@ -152,7 +152,7 @@ def lit(
         textured[group.coordinates] = float(group.control == "texture")
     light.traced = renderer.like(transfer="linear")
     gradient = light.renderer.gradient(smooth_loss(renderer.formation.resolution), u, 0, 1)[1] * textured
-    given, wanted = inward(renderer, gradient, textured, 1, 4 * REFERENCE_SPP)
+    given, wanted = measure_inward_slope(renderer, gradient, textured, 1, 4 * REFERENCE_SPP)
     error = abs(given / wanted - 1.0) if wanted else abs(given)
     seen = (
         check("largest derivative by a texel", float(gradient.abs().max()), 0.0, 0.0)
@@ -184,11 +184,11 @@ LIT: list[tuple[str, str, dict[str, Any]]] = [
      {"controls": INSIDE, "slope": 0.4}),
     ("lit-4-texels", "A texture of 4 texels is predicted.",
      {"controls": {"texture": {"resolution": 2}, "camera": {}}}),
-    ("lit-black-and-white", "Texels that are exactly 0 and 1 are predicted.", {"thing": black_and_white}),
+    ("lit-black-and-white", "Texels that are exactly 0 and 1 are predicted.", {"thing": make_checkered_mug}),
     ("lit-unseen-texels", "Texels that the view does not meet have a derivative of 0, and change nothing.", {}),
     ("lit-map-half-black", "A map that is half black and half white is predicted.",
      {"environment": EnvironmentAsset("half", HALF), "levels": 1.5 * LEVELS}),
-    ("lit-map-white", "A map that is white everywhere is predicted.", {"environment": grey_map(1.0)}),
+    ("lit-map-white", "A map that is white everywhere is predicted.", {"environment": make_grey_map(1.0)}),
     ("lit-map-black", "The picture is black, the derivative 0.", {"environment": NIGHT, "slope": None, "levels": 1e-6}),
     ("lit-sun", "A sun of one texel, 300,000 times as bright as the sky, casts the shadow that is traced.",
      {"environment": FLASH, "levels": 1.5 * LEVELS}),
@@ -207,7 +207,7 @@ def test_a_mirror_is_too_far_off_and_the_comparison_says_so() -> None:
     """A mirror is too far off, and the comparison says so."""
     off = []
     for settings in (MIRROR, {}):
-        renderer = small(PAINTED, settings=settings, denoise="oidn")
+        renderer = make_renderer(PAINTED, settings=settings, denoise="oidn")
         with torch.no_grad():
             picture = SurfaceRenderer(renderer, renderer.start, seed=1)(renderer.start)
         off.append(Deviation.of([view_of(renderer, picture, renderer.start, 3, 8, lambda *at: 0.0)]).share / ACCEPTED)
@@ -220,9 +220,11 @@ def test_a_mirror_is_too_far_off_and_the_comparison_says_so() -> None:
 
 def test_what_stands_behind_glass_is_refused() -> None:
     """An object behind clear glass is refused in words."""
-    reason = why_not(small(PAINTED, parts=[glass()]), ["camera"])
+    reason = why_not(make_renderer(PAINTED, plugins=make_glass_ball()), ["camera"])
     checks = [
         holds("it says that there is more in the scene", reason is not None and "more in the scene" in reason.text),
-        holds("without the glass it is not refused", why_not(small(PAINTED, denoise="oidn"), ["camera"]) is None),
+        holds(
+            "without the glass it is not refused", why_not(make_renderer(PAINTED, denoise="oidn"), ["camera"]) is None
+        ),
     ]
     right(Outcome(checks))

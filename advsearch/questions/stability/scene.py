@@ -17,7 +17,7 @@ from torch import Tensor
 from advsearch.extend import Domain, Evaluation, Policy, SceneDescription, assets, gradients, results, workbench
 from advsearch.questions.stability.result import Outcome, check, holds
 
-SIZE = 24  # side of the pictures in pixels
+SIZE = 24  # side of the images in pixels
 SPP = 8  # samples a pixel of a picture and of a working gradient
 REFERENCE_SPP = 64  # samples a pixel of a reference render
 ERROR = 0.1  # relative error that the mean of a gradient may have beyond what its noise explains
@@ -29,7 +29,7 @@ Thing = str | Path | assets.ObjectAsset | Callable[[], assets.ObjectAsset]
 """What a scene shows; a function makes it when the case runs."""
 
 
-def small(
+def make_renderer(
     controls: ControlSettings, thing: Thing = "mug", *,
     environment: str | Path | assets.EnvironmentAsset | None = None, settings: Mapping[str, float] | None = None,
     plugins: Mapping[str, Mapping[str, object]] = MappingProxyType({}), denoise: str = "none",
@@ -39,7 +39,7 @@ def small(
     Its differences are taken over a pixel: the losses of these cases are smooth.
     """
     shape = thing() if callable(thing) else thing
-    scene = workbench.load_scene(shape, environment or plain_environment(), settings=settings)
+    scene = workbench.load_scene(shape, environment or make_plain_environment(), settings=settings)
     description = scene.description
     for name, plugin in plugins.items():
         description = description.with_part(workbench.PluginPart(name, plugin))
@@ -52,21 +52,21 @@ def describe_mug() -> SceneDescription:
     return workbench.load_scene("mug").description
 
 
-def plain_environment() -> assets.EnvironmentAsset:
+def make_plain_environment() -> assets.EnvironmentAsset:
     """Return a sky brighter on one side and above, (16, 32, 3), so that turning it changes something."""
     rows, columns = np.mgrid[0:16, 0:32].astype(np.float32)
     light = 0.4 * (1.0 + 0.6 * np.sin(columns * (2.0 * np.pi / 32.0)) + 0.8 * np.cos(rows * (np.pi / 16.0)))
     return assets.EnvironmentAsset("plain", np.repeat(light[:, :, None], 3, axis=2).clip(0.05).astype(np.float32))
 
 
-def grey_map(value: float, texel: float | None = None) -> assets.EnvironmentAsset:
+def make_grey_map(value: float, texel: float | None = None) -> assets.EnvironmentAsset:
     radiance: assets.Floats = np.full((16, 32, 3), value, np.float32)
     if texel is not None:
         radiance[4, 10] = texel
     return assets.EnvironmentAsset("made", radiance)
 
 
-def mesh_of(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]) -> assets.Mesh:
+def make_mesh(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]) -> assets.Mesh:
     """Return a mesh with UVs from x and z, whose normals face +x."""
     points = np.asarray(vertices, np.float32)
     facing = np.tile([1.0, 0.0, 0.0], (len(points), 1))
@@ -75,7 +75,7 @@ def mesh_of(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]])
     return assets.Mesh(points, np.asarray(faces, np.uint32), facing.astype(np.float32), uvs.astype(np.float32))
 
 
-def checked(mesh: assets.Mesh) -> assets.ObjectAsset:
+def make_checkered_object(mesh: assets.Mesh) -> assets.ObjectAsset:
     """Return an object with a checked texture around a display-referred grey."""
     checks = np.indices((4, 4)).sum(axis=0) % 2
     base = np.float32(0.5) + np.float32(0.3) * (checks - np.float32(0.5))
@@ -83,64 +83,62 @@ def checked(mesh: assets.Mesh) -> assets.ObjectAsset:
     return assets.ObjectAsset("thing", mesh, texels, assets.Material())
 
 
-def painted(texels: np.ndarray) -> assets.ObjectAsset:
+def paint_mug(texels: np.ndarray) -> assets.ObjectAsset:
     grey = np.repeat(texels[:, :, None], 3, axis=2).astype(np.float32)
     return replace(describe_mug().object, name="painted", base_color=grey)
 
 
-def black_and_white() -> assets.ObjectAsset:
-    return painted(np.indices((8, 8)).sum(axis=0) % 2)
+def make_checkered_mug() -> assets.ObjectAsset:
+    return paint_mug(np.indices((8, 8)).sum(axis=0) % 2)
 
 
-def dark() -> assets.ObjectAsset:
+def make_dark_mug() -> assets.ObjectAsset:
     """Return the mug in black: what moves in the picture is its outline and nothing else, so little noise."""
-    return painted(np.full((4, 4), 0.02))
+    return paint_mug(np.full((4, 4), 0.02))
 
 
-Range = tuple[float | None, float | None]
+Bounds = tuple[float | None, float | None]
 
 
-def seen(
+def check_scene(
     controls: ControlSettings, thing: Thing = "mug", *, u: Sequence[float] | Mapping[int, float] | None = None,
     spp: int = SPP, compare: bool = True, seeds: tuple[int, int] = (3, 12), repeats: int = 24, evaluations: int = 3,
-    mean: Range | None = None, gradient: Range | None = None, ending: str = "",
-    beside: Mapping[str, object] | None = None, apart: Range = (None, SAME_PICTURE), **scene: object,
+    mean: Bounds | None = None, gradient: Bounds | None = None, ending: str = "",
+    beside: Mapping[str, object] | None = None, apart: Bounds = (None, SAME_PICTURE), **scene: object,
 ) -> Outcome:  # fmt: skip
     """Render a scene, differentiate it, compare the gradient with differences, which costs most of the time, and search
     from there.
 
     Args:
         u: the configuration, or numbers of it in place of those of the start.
-        mean, gradient, ending: what the picture's mean, the largest entry of the gradient and the search's ending have
+        mean, gradient, ending: what the image's mean, the largest entry of the gradient and the search's ending have
             to be.
-        beside: the arguments of `small` for another scene, and `apart` the mean difference that its picture may have.
-        scene: further arguments of `small`.
+        beside: the arguments of `make_renderer` for another scene, and `apart` the mean difference that its image may
+            have.
+        scene: further arguments of `make_renderer`.
     """
-    renderer = small(controls, thing, **scene)  # type: ignore[arg-type]
-    at = renderer.start.clone()
+    renderer = make_renderer(controls, thing, **scene)  # type: ignore[arg-type]
+    start = renderer.start.clone()
     for index, value in u.items() if isinstance(u, Mapping) else enumerate(u or ()):
-        at[index] = value
+        start[index] = value
     loss = gradients.smooth_loss(renderer.formation.resolution)
-    picture = shown(renderer, at, 0, spp)
-    _, slope = renderer.gradient(loss, at, 0, spp)
-    finite = bool(torch.isfinite(picture).all()) and bool(torch.isfinite(slope).all())
-    rows = compared(renderer, at, spp=spp, seeds=seeds, repeats=repeats) if compare else []
-    # a linear model of two classes: its logits are 0, and so many times the rise of the loss over the start, less 1
-    here, domain = float(loss(shown(renderer, at, 0, spp))), search_domain(renderer, at)
-    rise = lambda image: SHARPNESS * (loss(image) - here) - 1.0  # noqa: E731
-    steps = evaluations * (1 + domain.gradient_cost) + 1
-    result = searched(renderer, rise, steps, spp=spp, start=at, candidates=1, repeats=1)
+    image = render_image(renderer, start, 0, spp)
+    _, slope = renderer.gradient(loss, start, 0, spp)
+    rows = compare_gradient(renderer, start, spp=spp, seeds=seeds, repeats=repeats) if compare else []
+    result = search_scene(renderer, loss, start, spp, evaluations)
     checks = [
-        holds("the picture is in [0, 1]", float(picture.min()) >= 0.0 and float(picture.max()) <= 1.0),
+        holds("the picture is in [0, 1]", float(image.min()) >= 0.0 and float(image.max()) <= 1.0),
         check("values that were NaN or infinite", float(renderer.non_finite), 0.0, 0.0),
         check("objectives that were NaN or infinite", float(result.non_finite_objectives), 0.0, 0.0),
     ]
-    worst = max(rows, key=lambda row: (row.excess, row.bias or 0.0), default=None)
-    if worst is not None:
+    relative_error = None
+    if rows:
+        worst = max(rows, key=lambda row: (row.excess, row.bias or 0.0))
         unsure = max(rows, key=lambda row: row.doubt or 0.0)
         checks.append(check(f"noise of the comparison, {unsure.name}", unsure.doubt or 0.0, most=DOUBT))
         checks.append(check(f"gradient error beyond the noise, {worst.name}", worst.excess, most=ERROR))
-    measured = {"mean": float(picture.mean()), "largest gradient": float(slope.abs().max())}
+        relative_error = worst.bias
+    measured = {"mean": float(image.mean()), "largest gradient": float(slope.abs().max())}
     if mean is not None:
         checks.append(check("mean of the picture", measured["mean"], *mean))
     if gradient is not None:
@@ -148,73 +146,98 @@ def seen(
     if ending:
         checks.append(holds(f"the ending is {ending!r}", result.ending.value == ending))
     if beside is not None:
-        other = small(**{"controls": controls, **beside})  # type: ignore[arg-type]
-        difference = float((shown(renderer, at) - shown(other, other.start)).abs().mean())
+        other = make_renderer(**{"controls": controls, **beside})  # type: ignore[arg-type]
+        difference = mean_difference(render_image(renderer, start), render_image(other, other.start))
         checks.append(check("mean difference from the picture beside it", difference, *apart))
-    finite = finite and renderer.non_finite == 0
-    return Outcome(checks, finite, worst.bias if worst else None, result.ending.value, measured)
+    is_finite = bool(torch.isfinite(image).all()) and bool(torch.isfinite(slope).all()) and renderer.non_finite == 0
+    return Outcome(checks, is_finite, relative_error, result.ending.value, measured)
 
 
-def shown(renderer: gradients.Renderer, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
+def search_scene(
+    renderer: gradients.Renderer, loss: gradients.Loss, start: Tensor, spp: int, evaluations: int
+) -> workbench.SearchResult:
+    """Search from a configuration with the margin of a linear model of two classes: its logits are 0, and so many times
+    the rise of the loss over the start, less 1."""
+    loss_at_start = float(loss(render_image(renderer, start, 0, spp)))
+    gradient_cost = make_domain(renderer, start).gradient_cost
+
+    def margin(image: Tensor) -> Tensor:
+        return SHARPNESS * (loss(image) - loss_at_start) - 1.0
+
+    steps = evaluations * (1 + gradient_cost) + 1
+    return run_search(renderer, margin, steps, spp=spp, start=start, candidates=1, repeats=1)
+
+
+def render_image(renderer: gradients.Renderer, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
     with torch.no_grad():
         return renderer(u, seed, spp)
 
 
-def compared(
+def mean_difference(image: Tensor, other: Tensor) -> float:
+    return float((image - other).abs().mean())
+
+
+def compare_gradient(
     renderer: gradients.Renderer, u: Tensor, *, spp: int = SPP, seeds: tuple[int, int] = (3, 12), repeats: int = 24
 ) -> list[results.Measured]:
-    """Compare the plan's own gradient with common-random-number differences, of a linear loss of the raw picture."""
-    before = renderer.formation
-    renderer.formation = replace(before, transfer="linear")
+    """Compare the plan's own gradient with common-random-number differences, of a linear loss of the raw image."""
+    formation = renderer.formation
+    bench = gradients.Bench(renderer, gradients.smooth_loss(formation.resolution), u, seed=1, spp=spp)
+    renderer.formation = replace(formation, transfer="linear")  # of this renderer, which counts what is not finite
     try:
-        bench = gradients.Bench(renderer, gradients.smooth_loss(before.resolution), u, seed=1, spp=spp)
         rows = gradients.measure_derivatives(
             bench, reference_spp=REFERENCE_SPP, seeds_of_reference=seeds, repeats=(repeats, repeats)
         )
         return list(rows)
     finally:
-        renderer.formation = before
+        renderer.formation = formation
 
 
-def inward(
-    renderer: gradients.Renderer, slope: Tensor, of: Tensor | float, seeds: int, spp: int
+def measure_inward_slope(
+    renderer: gradients.Renderer, gradient: Tensor, factor: Tensor | float, seeds: int, spp: int
 ) -> tuple[float, float]:
-    """Return the derivative of the smooth linear loss of the raw picture as numbers go inwards from the start that
-    raise it so, where `of` is 1: by a gradient (d,), and by one-sided differences of second order, since there is no
+    """Return the derivative of the smooth linear loss of the raw image as numbers go inwards from the start that raise
+    it so, where `factor` is 1: by a gradient (d,), and by one-sided differences of second order, since there is no
     other side at a bound."""
-    raw, u, step = renderer.like(transfer="linear"), renderer.start, 0.04
-    loss = gradients.smooth_loss(raw.formation.resolution)
-    direction = torch.where(u > 0.5, -1.0, 1.0) * (slope * (0.5 - u) > 0.0) * of
-    wanted = []
+    linear, u, step = renderer.like(transfer="linear"), renderer.start, 0.04
+    loss = gradients.smooth_loss(linear.formation.resolution)
+    direction = torch.where(u > 0.5, -1.0, 1.0) * (gradient * (0.5 - u) > 0.0) * factor
+    slopes = []
     for seed in range(seeds):
-        here, near, far = (float(loss(shown(raw, u + k * step * direction, seed, spp))) for k in range(3))
-        wanted.append((4.0 * near - 3.0 * here - far) / (2.0 * step))
-    return float(slope @ direction), math.fsum(wanted) / seeds
+        here, near, far = (
+            float(loss(render_image(linear, u + count * step * direction, seed, spp))) for count in range(3)
+        )
+        slopes.append((4.0 * near - 3.0 * here - far) / (2.0 * step))
+    return float(gradient @ direction), math.fsum(slopes) / seeds
 
 
-def evaluated(renderer: gradients.Renderer, loss: gradients.Loss, spp: int, query: workbench.Query) -> Evaluation:
-    """Evaluate a configuration by a loss of the picture; over 0 is a success."""
-    u, seed, spp, derivative = query.u, query.number, spp * query.samples, None
-    bad, renders = renderer.non_finite, renderer.renders
+def evaluate(renderer: gradients.Renderer, loss: gradients.Loss, spp: int, query: workbench.Query) -> Evaluation:
+    """Evaluate a configuration by a loss of the image; over 0 is a success."""
+    spp *= query.samples
+    non_finite_before, renders_before = renderer.non_finite, renderer.renders
+    gradient = None
     if query.gradient:
-        value, derivative = renderer.gradient(loss, u, seed, spp, free=query.gradient == "free")
+        value, gradient = renderer.gradient(loss, query.u, query.number, spp, free=query.gradient == "free")
     else:
-        value = loss(shown(renderer, u, seed, spp))
-    cost = (renderer.renders - renders) * query.samples
-    return Evaluation(float(value), derivative, float(value) > 0.0, renderer.non_finite - bad, cost)
+        value = loss(render_image(renderer, query.u, query.number, spp))
+    objective = float(value)
+    cost = (renderer.renders - renders_before) * query.samples
+    return Evaluation(objective, gradient, objective > 0.0, renderer.non_finite - non_finite_before, cost)
 
 
-def searched(
+def run_search(
     renderer: gradients.Renderer, loss: gradients.Loss, steps: int, *, spp: int = SPP, start: Tensor | None = None,
-    policy: Policy[Any] | None = None, **more: Any,
+    policy: Policy[Any] | None = None, **options: Any,
 ) -> workbench.SearchResult:  # fmt: skip
-    """Search for a picture of a loss over 0."""
-    evaluate, domain = partial(evaluated, renderer, loss, spp), search_domain(renderer, start)
+    """Search for an image of a loss over 0; `options` as of `attacks.search`."""
+    evaluate_all = partial(map, partial(evaluate, renderer, loss, spp))
     policy = policy or workbench.make_policy("pgd")
-    return workbench.search(partial(map, evaluate), domain, policy, steps=steps, seed=0, **{"candidates": 0, **more})
+    options = {"candidates": 0, **options}
+    return workbench.search(evaluate_all, make_domain(renderer, start), policy, steps=steps, seed=0, **options)
 
 
-def search_domain(renderer: gradients.Renderer, start: Tensor | None = None) -> Domain:
-    space: Any = renderer.space  # of controls, since `small` made it
+def make_domain(renderer: gradients.Renderer, start: Tensor | None = None) -> Domain:
+    """Return where a search may look, from a configuration or the renderer's start."""
+    space: Any = renderer.space  # of controls, since `make_renderer` made it
     start = renderer.start if start is None else start
     return workbench.domain_of(space.controls, start, gradient_cost=renderer.plan.renders, partial_gradients=True)

@@ -34,30 +34,31 @@ from advsearch.questions.stability.scene import (
     SHARPNESS,
     SPP,
     ControlSettings,
-    black_and_white,
-    checked,
-    compared,
-    dark,
+    check_scene,
+    compare_gradient,
     describe_mug,
-    evaluated,
-    grey_map,
-    inward,
-    mesh_of,
-    search_domain,
-    searched,
-    seen,
-    shown,
-    small,
+    evaluate,
+    make_checkered_mug,
+    make_checkered_object,
+    make_dark_mug,
+    make_domain,
+    make_grey_map,
+    make_mesh,
+    make_renderer,
+    mean_difference,
+    measure_inward_slope,
+    render_image,
+    run_search,
 )
 
 BRIGHT = 1e5
 PLATEAU_STEPS = 40  # evaluations in which a search has to be off a plateau
 TEXTURE: ControlSettings = {"texture": {"resolution": 8}}
-FLASH = grey_map(0.3, BRIGHT)
-DARKNESS = grey_map(0.0)
+FLASH = make_grey_map(0.3, BRIGHT)
+DARKNESS = make_grey_map(0.0)
 
 
-def exposed(control: str, low: float, high: float) -> dict[str, object]:
+def exposure_case(control: str, low: float, high: float) -> dict[str, object]:
     controls = {control: {"exposure": [low, high]}, "texture": {"resolution": 8}}
     return {"controls": controls, "u": {0: float(high > 0.0)}, "slow": control == "environment"}
 
@@ -68,7 +69,7 @@ LAMP = {"light": {"type": "point", "power": [0.0, 20.0], "x": 1.0, "y": 1.0, "z"
 BRIGHT_TEXEL = {"environment": {"exposure": [-1.0, 1.0]}, "texture": {"resolution": 16}}
 TURNED = {"environment": {"rotation": [0.0, 360.0]}}
 
-cases("radiometric", seen, [
+cases("radiometric", check_scene, [
     ("hdri-texel-100000", "One texel of 100,000 leaves everything finite, and gradients are right.",
      {"controls": BRIGHT_TEXEL, "environment": FLASH, "slow": True}),
     ("hdri-texel-100000-denoised", "It is finite after the denoiser too, and the rotation has a gradient.",
@@ -79,16 +80,16 @@ cases("radiometric", seen, [
       "mean": (0.0, 0.0), "gradient": (0.0, 0.0), "ending": "stalled"}),
     ("lamp-in-the-dark", "A lamp lights a scene that has no other light.",
      {"controls": LAMP, "environment": DARKNESS, "u": [0.5], "mean": (0.01, None)}),
-    ("camera-exposure-up", RIGHT, exposed("camera", 9.0, 10.0)),
-    ("camera-exposure-down", RIGHT, exposed("camera", -10.0, -9.0)),
-    ("environment-exposure-up", RIGHT, exposed("environment", 9.0, 10.0)),
-    ("environment-exposure-down", RIGHT, exposed("environment", -10.0, -9.0)),
+    ("camera-exposure-up", RIGHT, exposure_case("camera", 9.0, 10.0)),
+    ("camera-exposure-down", RIGHT, exposure_case("camera", -10.0, -9.0)),
+    ("environment-exposure-up", RIGHT, exposure_case("environment", 9.0, 10.0)),
+    ("environment-exposure-down", RIGHT, exposure_case("environment", -10.0, -9.0)),
 ])  # fmt: skip
 
 
-def refused_texel(value: float, as_file: bool) -> Outcome:
+def refuse_texel(value: float, as_file: bool) -> Outcome:
     """A texel that is no light, in a file or in an array, has to be refused in a sentence."""
-    radiance = grey_map(0.3).radiance.copy()
+    radiance = make_grey_map(0.3).radiance.copy()
     radiance[4, 10] = value
     try:
         if as_file:
@@ -98,8 +99,8 @@ def refused_texel(value: float, as_file: bool) -> Outcome:
                     picture.write(str(path))
                 workbench.load_scene("mug", path)
         else:
-            renderer = small(TEXTURE, environment=assets.EnvironmentAsset("made", radiance))
-            shown(renderer, renderer.start, 0, 1)
+            renderer = make_renderer(TEXTURE, environment=assets.EnvironmentAsset("made", radiance))
+            render_image(renderer, renderer.start, 0, 1)
     except InputError as error:
         counted = "texels" in str(error) and "\n" not in str(error)
         return Outcome([holds("refused in a sentence that counts the texels", counted)], ending="refused")
@@ -110,24 +111,24 @@ REFUSED = "The map is refused before anything is rendered."
 for word, value in (("negative", -1.0), ("infinite", math.inf), ("nan", math.nan)):
     for place in ("file", "array"):
         given = {"value": value, "as_file": place == "file"}
-        cases("radiometric", refused_texel, [(f"{word}-texel-{place}", REFUSED, given)])
+        cases("radiometric", refuse_texel, [(f"{word}-texel-{place}", REFUSED, given)])
 
 
-def plateau(low: float, high: float) -> Outcome:
+def leave_plateau(low: float, high: float) -> Outcome:
     """Start where the picture is white and nothing has a gradient; the way out is an exposure further down.
 
     Args:
         low, high: stops that are searched. Up to about 4 something in the picture is not white.
     """
-    renderer = small({"camera": {"exposure": [low, high]}})
+    renderer = make_renderer({"camera": {"exposure": [low, high]}})
     start, checks, endings, flat = torch.ones_like(renderer.start), [], [], 0
     loss = lambda image: 0.9 - image.mean()  # noqa: E731
     for policy in map(workbench.make_policy, ("pgd", "adam", "auto")):
-        result = searched(renderer, loss, PLATEAU_STEPS, spp=2, start=start, policy=policy)
+        result = run_search(renderer, loss, PLATEAU_STEPS, spp=2, start=start, policy=policy)
         flat += sum(record.gradient_norm == 0.0 for record in result.history)
         checks.append(holds(f"{policy.name} finds a picture that is not white", result.best_objective > 0.0))
         endings.append(f"{policy.name}: {result.ending.value}")
-    slope = evaluated(renderer, loss, 2, workbench.Query(start, 0, gradient=True)).gradient
+    slope = evaluate(renderer, loss, 2, workbench.Query(start, 0, gradient=True)).gradient
     assert slope is not None
     at_first = check("gradient at the start", float(slope.abs().max()), 0.0, 0.0)
     measured = {"evaluations without a gradient": float(flat)}
@@ -135,7 +136,7 @@ def plateau(low: float, high: float) -> Outcome:
 
 
 AWAY = f"From a white picture without a gradient every policy gets away within {PLATEAU_STEPS} evaluations"
-cases("radiometric", plateau, [
+cases("radiometric", leave_plateau, [
     ("saturated-plateau", f"{AWAY}.", {"low": -10.0, "high": 10.0}),
     ("saturated-plateau-narrow-way-out", f"{AWAY}; the way out is a tenth of the range.", {"low": 1.0, "high": 10.0}),
 ])  # fmt: skip
@@ -144,7 +145,7 @@ cases("radiometric", plateau, [
 # ---- surfaces -------------------------------------------------------------------------------------------------------
 
 
-def glass() -> dict[str, dict[str, object]]:
+def make_glass_ball() -> dict[str, dict[str, object]]:
     """Return a ball of clear glass before the mug, by name, in Mitsuba's words; nothing of it varies."""
     camera = geometry.camera_to_world(describe_mug())[:3, 3]
     center = [float(value) for value in camera * 0.6 + np.array([0.0, 0.0, 0.2])]
@@ -152,42 +153,42 @@ def glass() -> dict[str, dict[str, object]]:
     return {"glass": {"type": "sphere", "center": center, "radius": 0.3, "bsdf": material}}
 
 
-def surface(searched: tuple[str, ...], slow: bool = True, **values: float) -> dict[str, object]:
+def material_case(parameters: tuple[str, ...], slow: bool = True, **values: float) -> dict[str, object]:
     settings = {f"material.{name}": value for name, value in values.items()}
-    return {"controls": {"material": {name: [0.0, 1.0] for name in searched}}, "settings": settings, "slow": slow}
+    return {"controls": {"material": {name: [0.0, 1.0] for name in parameters}}, "settings": settings, "slow": slow}
 
 
-cases("materials", seen, [
+cases("materials", check_scene, [
     ("roughness-0", "Finite, and the gradient by the roughness is right, at the polished end.",
-     surface(("roughness",), slow=False, roughness=0.0)),
+     material_case(("roughness",), slow=False, roughness=0.0)),
     ("roughness-1", "Finite, and the gradient by the roughness is right, at the matt end.",
-     surface(("roughness",), roughness=1.0, metallic=1.0)),
+     material_case(("roughness",), roughness=1.0, metallic=1.0)),
     ("metallic-1", "Finite, and the gradient has the right sign and size at a metallic of exactly 1.",
-     surface(("metallic",), metallic=1.0)),
+     material_case(("metallic",), metallic=1.0)),
     ("perfect-mirror", "A metal of roughness 0 is finite, and both gradients are right.",
-     surface(("roughness", "metallic"), roughness=0.0, metallic=1.0)),
+     material_case(("roughness", "metallic"), roughness=0.0, metallic=1.0)),
 ])  # fmt: skip
 
 
 @case("materials", "clear-glass", slow=True)
-def clear_glass() -> Outcome:
+def look_through_glass() -> Outcome:
     """A texel behind clear glass has the right gradient, and nothing is NaN."""
     controls: ControlSettings = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}}
-    return seen(controls, plugins=glass(), beside={}, apart=(0.01, None))
+    return check_scene(controls, plugins=make_glass_ball(), beside={}, apart=(0.01, None))
 
 
 @case("materials", "texels-0-and-1")
 def texels_at_the_ends() -> Outcome:
     """Texels at the ends of the range have a gradient, and the search moves them inwards only."""
     controls = {"texture": {"resolution": 8, "epsilon": 0.2}}
-    renderer = small(controls, black_and_white)
+    renderer = make_renderer(controls, make_checkered_mug)
     raw, start = renderer.like(transfer="linear"), renderer.start
     loss = gradients.smooth_loss(raw.formation.resolution)
     slope = torch.stack([raw.gradient(loss, start, seed, REFERENCE_SPP)[1] for seed in range(8)]).mean(dim=0)
-    gradient, wanted = inward(renderer, slope, 1.0, 8, REFERENCE_SPP)
+    gradient, wanted = measure_inward_slope(renderer, slope, 1.0, 8, REFERENCE_SPP)
     error = abs(gradient / wanted - 1.0)
-    best = searched(renderer, loss, 3).best_u
-    return seen(controls, black_and_white, compare=False).also(
+    best = run_search(renderer, loss, 3).best_u
+    return check_scene(controls, make_checkered_mug, compare=False).also(
         check("gradient error along a direction that points inwards", error, most=ERROR),
         check("smallest texel of the adversarial configuration", float(best.min()), least=0.0),
         check("largest texel of the adversarial configuration", float(best.max()), most=1.0),
@@ -204,24 +205,25 @@ WHOLE = [1.0] * (3 * SIDE**2)
 ONE_TEXEL = {3 * (SIDE**2 // 2 + SIDE // 2) + channel: 1.0 for channel in range(3)}
 
 
-def thrown(u: Sequence[float] | Mapping[int, float] = WHOLE, **projector: float) -> dict[str, object]:
+def projector_case(u: Sequence[float] | Mapping[int, float] = WHOLE, **projector: float) -> dict[str, object]:
     controls = {"projector": {"resolution": SIDE, **projector}}
     return {"controls": controls, "u": u, "compare": False, "gradient": (1e-12, None)}
 
 
-cases("light", seen, [
+cases("light", check_scene, [
     ("projector-black", "A black picture changes nothing, and texels have a gradient.",
-     {**thrown({}), "beside": {"controls": {"lens": {}}}, "apart": (None, 0.02)}),
-    ("projector-full", FINITE, thrown()),
-    ("projector-one-texel", FINITE, thrown(ONE_TEXEL)),
-    ("projector-grazing", FINITE, thrown(elevation=0.5)),
-    ("projector-behind-the-object", FINITE, thrown(azimuth=220.0)),
-    ("projector-inside-the-object", FINITE, thrown(distance=0.01, fov=30.0)),
+     {**projector_case({}), "beside": {"controls": {"lens": {}}}, "apart": (None, 0.02)}),
+    ("projector-full", FINITE, projector_case()),
+    ("projector-one-texel", FINITE, projector_case(ONE_TEXEL)),
+    ("projector-grazing", FINITE, projector_case(elevation=0.5)),
+    ("projector-behind-the-object", FINITE, projector_case(azimuth=220.0)),
+    ("projector-inside-the-object", FINITE, projector_case(distance=0.01, fov=30.0)),
     ("projector-into-a-mirror", FINITE,
-     {**thrown(), "settings": {"material.metallic": 1.0, "material.roughness": 0.0}}),
-    ("projector-0-lumens", "Without light the gradient is zero.", {**thrown(lumens=0.0), "gradient": (0.0, 0.0)}),
+     {**projector_case(), "settings": {"material.metallic": 1.0, "material.roughness": 0.0}}),
+    ("projector-0-lumens", "Without light the gradient is zero.",
+     {**projector_case(lumens=0.0), "gradient": (0.0, 0.0)}),
     ("projector-1e6-lumens", "The picture is white for the most part, and all is finite.",
-     {**thrown(lumens=1e6), "gradient": (None, None), "mean": (0.7, None)}),
+     {**projector_case(lumens=1e6), "gradient": (None, None), "mean": (0.7, None)}),
     ("spot-smallest", "Picture and gradient of a laser's spot are finite.",
      {"controls": {"spot": {"width": [0.02, 0.1], "lumens": [0.0, 10.0]}}, "u": [0.0, 1.0], "compare": False,
       "gradient": (1e-12, None)}),
@@ -229,34 +231,35 @@ cases("light", seen, [
 
 
 @case("light", "projector-through-glass")
-def through_glass() -> Outcome:
+def project_through_glass() -> Outcome:
     """Light that meets glass on its way leaves picture and gradient finite."""
-    along = thrown(azimuth=describe_mug().number("camera.azimuth"))
-    return seen(**along, plugins=glass())  # type: ignore[arg-type]
+    along = projector_case(azimuth=describe_mug().number("camera.azimuth"))
+    return check_scene(**along, plugins=make_glass_ball())  # type: ignore[arg-type]
 
 
 # ---- meshes, places and views ---------------------------------------------------------------------------------------
 
 QUAD = [[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]]  # a square that faces +x
 HALVES = [[0, 1, 2], [0, 2, 3]]
-SQUARE = checked(mesh_of(QUAD, HALVES))
+SQUARE = make_checkered_object(make_mesh(QUAD, HALVES))
 LINE = [[0.0, 0.0, 0.5], [0.0, 0.1, 0.5], [0.0, 0.2, 0.5]]
-DEGENERATE = checked(mesh_of(QUAD + LINE, [*HALVES, [0, 0, 1], [4, 5, 6], [4, 4, 4]]))
-TWICE = checked(mesh_of(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]]))
-SLIVER = checked(mesh_of([*QUAD, [0.0, -0.5, 0.5], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5 + 1e-6]], [*HALVES, [4, 5, 6]]))
-TRIANGLE = checked(mesh_of([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]]))
+DEGENERATE = make_checkered_object(make_mesh(QUAD + LINE, [*HALVES, [0, 0, 1], [4, 5, 6], [4, 4, 4]]))
+TWICE = make_checkered_object(make_mesh(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]]))
+THIN = [[0.0, -0.5, 0.5], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5 + 1e-6]]
+SLIVER = make_checkered_object(make_mesh(QUAD + THIN, [*HALVES, [4, 5, 6]]))
+TRIANGLE = make_checkered_object(make_mesh([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]]))
 FRONT = {"camera.azimuth": 0.0, "camera.elevation": 10.0}
 PAINTED: ControlSettings = {"texture": {"resolution": 8}, "pose": {"y": [-0.3, 0.3]}}
 SHIFT: ControlSettings = {"pose": {"x": [-0.3, 0.3]}}
 BARE = {"ground.size": 0.0}  # settings without the ground, so that a dark object has an outline and nothing else
 
 
-def mesh(thing: assets.ObjectAsset, beside: assets.ObjectAsset | None = None) -> dict[str, object]:
+def mesh_case(thing: assets.ObjectAsset, beside: assets.ObjectAsset | None = None) -> dict[str, object]:
     like = {"beside": {"thing": beside, "settings": FRONT}} if beside else {}
     return {"controls": PAINTED, "thing": thing, "settings": FRONT, "slow": True, **like}
 
 
-def box_in_a_file(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
+def import_box(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
     """A box as a file gives it, in some unit and at some distance from the file's origin."""
     points = np.array([[x, y, z] for x in (-0.3, 0.3) for y in (-0.5, 0.5) for z in (0.0, 1.0)]) * scale + shift
     corners = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]]
@@ -269,39 +272,39 @@ def box_in_a_file(scale: float = 1.0, shift: float = 0.0) -> assets.ObjectAsset:
         return workbench.load_scene(path).description.object
 
 
-def from_a_file(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
-    thing = partial(box_in_a_file, scale, shift)
-    return {"controls": SHIFT, "thing": thing, "compare": False, "beside": {"thing": box_in_a_file}}
+def file_case(scale: float = 1.0, shift: float = 0.0) -> dict[str, object]:
+    thing = partial(import_box, scale, shift)
+    return {"controls": SHIFT, "thing": thing, "compare": False, "beside": {"thing": import_box}}
 
 
-def outline(controls: ControlSettings) -> dict[str, object]:
-    return {"controls": controls, "thing": dark, "settings": BARE, "u": [0.5]}
+def outline_case(controls: ControlSettings) -> dict[str, object]:
+    return {"controls": controls, "thing": make_dark_mug, "settings": BARE, "u": [0.5]}
 
 
 AWAY_FROM_IT = {"controls": {"pose": {"z": [-3.0, -2.0]}}, "settings": {"pose.x": 9e3}}
-cases("geometry", seen, [
+cases("geometry", check_scene, [
     ("degenerate-triangles", "Faces without area change neither the picture nor the gradient.",
-     mesh(DEGENERATE, SQUARE)),
+     mesh_case(DEGENERATE, SQUARE)),
     ("sliver-triangles", "A triangle a million times as long as wide leaves everything finite and right.",
-     mesh(SLIVER)),
-    ("coincident-faces", "Two faces in one place look like one.", mesh(TWICE, SQUARE)),
-    ("one-triangle", "Finite, and both gradients are right.", mesh(TRIANGLE)),
+     mesh_case(SLIVER)),
+    ("coincident-faces", "Two faces in one place look like one.", mesh_case(TWICE, SQUARE)),
+    ("one-triangle", "Finite, and both gradients are right.", mesh_case(TRIANGLE)),
     ("scale-0.01", FINITE, {"controls": {"pose": {"scale": [0.01, 0.02]}}, "u": [0.0], "compare": False}),
     ("scale-100", FINITE, {"controls": {"pose": {"scale": [50.0, 100.0]}}, "u": [1.0], "compare": False}),
-    ("file-in-units-of-0.01", "A file in other units gives the same picture.", from_a_file(0.01)),
-    ("file-in-units-of-100", "A file in other units gives the same picture.", from_a_file(100.0)),
+    ("file-in-units-of-0.01", "A file in other units gives the same picture.", file_case(0.01)),
+    ("file-in-units-of-100", "A file in other units gives the same picture.", file_case(100.0)),
     ("file-10000-sizes-off", "A mesh that its file puts 10,000 sizes from the origin gives the same picture.",
-     from_a_file(shift=1e4)),
+     file_case(shift=1e4)),
     ("translation-10000", "The picture is that of the scene without the object, and the gradient is zero.",
      {"controls": {"pose": {"y": [9e3, 1e4]}}, "u": [1.0], "gradient": (None, 1e-6), "beside": AWAY_FROM_IT}),
     ("grazing-view", "Looking along the ground, the gradient by the elevation is right.",
-     outline({"camera": {"elevation": [-10.0, 10.0]}})),
+     outline_case({"camera": {"elevation": [-10.0, 10.0]}})),
     ("near-plane", "With the camera inside the object, picture and gradient are finite.",
      {"controls": {"camera": {"distance": [0.05, 0.2]}}, "u": [0.5], "compare": False}),
     ("object-fills-the-frame", "Finite where nothing but the object is seen.",
      {"controls": {"camera": {"distance": [0.5, 0.8], "fov": 10.0}}, "u": [0.5], "compare": False}),
     ("object-leaves-the-frame", "Half outside, the gradient by the shift is right.",
-     outline({"pose": {"x": [0.0, 2.0]}})),
+     outline_case({"pose": {"x": [0.0, 2.0]}})),
 ])  # fmt: skip
 
 
@@ -309,10 +312,10 @@ cases("geometry", seen, [
 def million() -> Outcome:
     """Finite, right, and like the coarse mesh of the same shape."""
     fine, rough = (assets.normalised(workbench.sphere(*counts)) for counts in ((501, 1000), (64, 128)))
-    coarse, renderer = (small(SHIFT, checked(made)) for made in (rough, fine))
+    coarse, renderer = (make_renderer(SHIFT, make_checkered_object(made)) for made in (rough, fine))
     _, slope = renderer.gradient(gradients.smooth_loss(renderer.formation.resolution), renderer.start, 0, SPP)
-    apart = float((shown(renderer, renderer.start, 0, 64) - shown(coarse, coarse.start, 0, 64)).abs().mean())
-    return seen(TEXTURE, checked(fine), evaluations=2).also(
+    apart = mean_difference(render_image(renderer, renderer.start, 0, 64), render_image(coarse, coarse.start, 0, 64))
+    return check_scene(TEXTURE, make_checkered_object(fine), evaluations=2).also(
         check("triangles", float(len(fine.faces)), least=1e6),
         holds("the gradient by a shift is finite", bool(torch.isfinite(slope).all())),
         check("mean difference from a sphere of 16,000", apart, most=SAME_PICTURE),
@@ -323,26 +326,28 @@ def million() -> Outcome:
 def gimbal() -> Outcome:
     """At a pitch of 90 degrees the gradients by angles and by the rotation vector are right."""
     angles = {"pose": {"yaw": [-90.0, 90.0], "pitch": [45.0, 135.0], "roll": [-90.0, 90.0], "on_ground": "no"}}
-    locked = small(angles, dark, settings=BARE)
-    yaw, roll = (shown(locked, torch.tensor(u)) for u in ([0.7, 0.5, 0.5], [0.5, 0.5, 0.3]))  # yaw 36 is roll -36 here
-    free = small({"pose": {"rotation": [-90.0, 90.0], "pitch": 90.0, "on_ground": "no"}}, dark, settings=BARE)
-    worst = max(row.excess for row in compared(free, free.start + 0.1, seeds=(3, 5)))
-    return seen(angles, dark, settings=BARE, u=[0.7, 0.5, 0.5], spp=2 * SPP).also(
-        check("mean difference of yaw 36 and roll -36", float((yaw - roll).abs().mean()), most=SAME_PICTURE),
+    locked = make_renderer(angles, make_dark_mug, settings=BARE)
+    # yaw 36 is roll -36 here
+    yaw, roll = (render_image(locked, torch.tensor(u)) for u in ([0.7, 0.5, 0.5], [0.5, 0.5, 0.3]))
+    rotation = {"pose": {"rotation": [-90.0, 90.0], "pitch": 90.0, "on_ground": "no"}}
+    free = make_renderer(rotation, make_dark_mug, settings=BARE)
+    worst = max(row.excess for row in compare_gradient(free, free.start + 0.1, seeds=(3, 5)))
+    return check_scene(angles, make_dark_mug, settings=BARE, u=[0.7, 0.5, 0.5], spp=2 * SPP).also(
+        check("mean difference of yaw 36 and roll -36", mean_difference(yaw, roll), most=SAME_PICTURE),
         check("gradient error of the rotation vector", worst, most=ERROR),
     )
 
 
 def full_turn(controls: ControlSettings) -> Outcome:
     """0 and 360 degrees are one place: one picture, one gradient, and a step across the seam goes on."""
-    renderer = small(controls)
+    renderer = make_renderer(controls)
     zero, one = torch.zeros_like(renderer.start), torch.ones_like(renderer.start)
     loss = gradients.smooth_loss(renderer.formation.resolution)
     slopes = [renderer.gradient(loss, u, 0, SPP)[1] for u in (zero, one)]
-    apart = float((shown(renderer, zero) - shown(renderer, one)).abs().mean())
-    wrapped = float(search_domain(renderer).project(one + 0.01).max())
+    apart = mean_difference(render_image(renderer, zero), render_image(renderer, one))
+    wrapped = float(make_domain(renderer).project(one + 0.01).max())
     size = float(slopes[0].abs().max())
-    return seen(controls, u=[0.0], compare=False).also(
+    return check_scene(controls, u=[0.0], compare=False).also(
         check("mean difference of the pictures", apart, most=SAME_PICTURE),
         check("difference of the gradients", float((slopes[0] - slopes[1]).abs().max()) / size, most=0.05),
         check("where a step of 0.01 past the end goes", wrapped, 0.0099, 0.0101),
@@ -434,13 +439,13 @@ def wide_range() -> Outcome:
     wide, narrow = ({"pose": {"x": [-reach, reach]}} for reach in (1e4, 0.3))
     slopes = []
     for controls, width in ((wide, 2e4), (narrow, 0.6)):
-        renderer = small(controls)
+        renderer = make_renderer(controls)
         loss = gradients.smooth_loss(renderer.formation.resolution)
         each = [float(renderer.gradient(loss, renderer.start, seed, 32)[1][0]) for seed in range(6)]
         slopes.append(statistics.fmean(each) / width)
     error = abs(slopes[0] / slopes[1] - 1.0)
     off = check("error of the derivative per object size", error, most=0.2)
-    return seen(wide, compare=False).also(off, relative_error=error)
+    return check_scene(wide, compare=False).also(off, relative_error=error)
 
 
 @case("stiff", "light-rotation-texel", slow=True)
@@ -451,25 +456,25 @@ def light_rotation_texel() -> Outcome:
         "pose": {"yaw": [0.0, 360.0]},
         "texture": {"resolution": 2},
     }
-    renderer = small(controls)
+    renderer = make_renderer(controls)
     u, loss = renderer.start.clone(), gradients.smooth_loss(renderer.formation.resolution)
     u[0], u[1] = 0.5, 0.1
     directions = torch.zeros(3, len(u))
     directions[0, 0] = directions[1, 1] = 1.0
     directions[2, 2:] = 1.0
     steps = [0.2, renderer.plan.groups[1].step * 2.0, 0.08]
-    second = hessian(lambda at: SHARPNESS * float(loss(shown(renderer, at, 0, 64))), u, directions, steps)
+    second = hessian(lambda at: SHARPNESS * float(loss(render_image(renderer, at, 0, 64))), u, directions, steps)
     units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
     paths: list[list[Tensor]] = []
     for scale in (1.0, RATIO):
         paths.append([])
         note = lambda record, at, evaluation: paths[-1].append(at)  # noqa: E731
         scaled = partial(lambda scale, image: scale * loss(image), scale)
-        result = searched(renderer, scaled, 18, spp=8, start=u, on_step=note)
+        result = run_search(renderer, scaled, 18, spp=8, start=u, on_step=note)
     path, again = map(torch.stack, paths)
     moved = (path - path[0]).abs().amax(dim=0)
     names = {"condition number in u": second, "condition number in watts, degrees and sRGB": units @ second @ units}
-    return seen(controls, u={0: 0.5, 1: 0.1}, compare=False).also(
+    return check_scene(controls, u={0: 0.5, 1: 0.1}, compare=False).also(
         *(
             check(f"how far {what} moved", float(distance), least=0.05)
             for what, distance in (("the power", moved[0]), ("the rotation", moved[1]), ("the texels", moved[2:].max()))
@@ -481,7 +486,7 @@ def light_rotation_texel() -> Outcome:
 
 
 MIXED = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}, "pose": {"y": [-0.3, 0.3]}}
-cases("noise", seen, [
+cases("noise", check_scene, [
     ("one-sample-a-pixel", "Finite; the mean of 48 gradients is right.",
      {"controls": MIXED, "spp": 1, "repeats": 48, "slow": True}),
     ("one-sample-a-pixel-denoised", "Finite after the denoiser too.",
@@ -496,12 +501,12 @@ def heavy_render(count: int = 24) -> Outcome:
     Of so many Gaussian numbers fewer than one lot in 1,000 has one farther from the median than 12 median distances.
     """
     controls = {"pose": {"x": [-0.3, 0.3]}}
-    renderer = small(controls).like(transfer="linear")
+    renderer = make_renderer(controls).like(transfer="linear")
     renderer.plan = renderer.plan.at_a_pixel()
     loss = gradients.smooth_loss(renderer.formation.resolution)
     slopes = torch.stack([renderer.gradient(loss, renderer.start, seed, 4)[1] for seed in range(count)]).double()
     away = (slopes - slopes.median()).abs()
-    return seen(controls, compare=False, spp=4).also(
+    return check_scene(controls, compare=False, spp=4).also(
         check("farthest over the median distance", float(away.max() / away.median()), most=12.0),
         holds("the plan takes secant", renderer.plan.groups[0].estimator == "secant"),
     )
