@@ -1,8 +1,15 @@
-"""Where a model is wrong, as rules: nodes of decision trees (Breiman et al. 1984) of one half of the rows, the best by
-weighted relative accuracy (Lavrac, Flach and Zupan 1999), made shorter where that costs nothing, one after the other
-(sequential covering; Friedman and Fisher 1999). The other half says whether a rule holds.
+"""Where a model is wrong, as rules over a table of rows.
 
-The rows are a *table*, a pandas frame: a column for each factor, float64 or a category of names in alphabetical order;
+Rules are nodes of decision trees (Breiman et al. 1984) of one half of the rows, the best by weighted relative accuracy
+(Lavrac, Flach and Zupan 1999), made shorter where that costs nothing, one after the other (sequential covering;
+Friedman and Fisher 1999). The other half says whether a rule holds.
+
+    table = rules.make_table(rows, ["pose.yaw", "light.power"])
+    choosing, counting = rules.split_in_halves(table, seed=0)
+    for rule in rules.find_rules(choosing, counting, seed=0).accepted:
+        print([condition.row.text for condition in rule.conditions], rules.estimate_share(rule.inside))
+
+A *table* is a pandas frame with a column for each factor, float64 or a category of names in alphabetical order;
 `correct`, whether the model was right; and `unit`, of what draw a row is: rows of one unit are not independent
 (`runs.tables.Units`). ``attrs["units"]`` has the unit of each factor, so its keys are the factors.
 """
@@ -27,43 +34,59 @@ from advsearch.options import OUT_OF_VIEW, Outcome
 from advsearch.runs.results import ConditionRow
 from advsearch.statistics.clustered import fewer_by_chance, mean_share, per_unit, share_interval
 
-Mask = npt.NDArray[np.bool_]
-FEWEST_ROWS = 100  # rows of which one half can choose and the other can count
-MOST_RULES = 5
-DEPTH = 3  # conditions of a rule, at most
-TREES = 24
-LEAST_SHARE, LEAST_ROWS, LEAST_UNITS = 0.01, 12, 3
+MIN_ROWS = 100  # rows of which one half can choose and the other can count
+MAX_RULES = 5
+MAX_CONDITIONS = 3  # of a rule
+N_TREES = 24
+MIN_COVERED_SHARE = 0.01
+MIN_COVERED_ROWS = 12
+MIN_COVERED_UNITS = 3
 """Of the rows that choose, a rule covers at least so many, and as many as so many units have."""
-KEPT = 0.97  # share of its weighted relative accuracy that a rule keeps when a condition is left out
-PASSES, BOUNDS = 3, 250  # how often all bounds of a rule are moved, and to how many places (quantiles) of their factor
-CHANCE = 0.01
-"""Probability that any rule is told that is none. Rules are tested one after the other, each only where all before it
-were told, so that each may be tested at all of it (a fixed sequence: Maurer, Hothorn and Lehmacher 1995)."""
-MOST_NEEDED = 1_000_000  # rows up to which it is said how many a rule would take
-LEAST_GAP = 0.1  # by how much more often the model is wrong under a rule than elsewhere, at least
-AROUND = 270.0  # degrees that the values of an angle span, at least, where it goes round: a grid of four values does
+RETAINED_ACCURACY = 0.97
+"""Share of its weighted relative accuracy that a rule retains when a condition is left out."""
+N_ADJUSTMENTS = 3  # how often all bounds of a rule are adjusted
+N_BOUNDS = 250  # to how many quantiles of their factor
+SIGNIFICANCE = 0.01
+"""Probability that any rule is accepted that is none. Rules are tested one after the other, each only where all before
+it were accepted, so that each may be tested at all of it (a fixed sequence: Maurer, Hothorn and Lehmacher 1995)."""
+MAX_NEEDED = 1_000_000  # rows up to which it is said how many a rule would take
+MIN_GAP = 0.1  # by how much more often the model is wrong under a rule than elsewhere
+MIN_ANGLE_RANGE = 270.0
+"""Degrees that the values of an angle span where it goes all the way round: a grid of four values does."""
 ARCS = ((360.0, 180.0), (180.0, 0.0), (180.0, 90.0))
-"""Of an angle that goes all the way round, trees see it once more by turn and zero, degrees: an arc through 0 is one
+"""Of an angle that goes all the way round, trees have it once more by turn and zero, degrees: an arc through 0 is one
 interval there, and so is what lies end-on, at 0 and at 180."""
+
+Mask = npt.NDArray[np.bool_]
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 
 # ---- tables ---------------------------------------------------------------------------------------------------------
 
 
-def observed(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
-    """Return a sweep's rows (`runs.tables`) as a table of those of some parameters that vary and that all rows have;
-    a prediction that was not judged is not right."""
-    table, units = dict[str, pd.Series](), dict[str, str]()
+def make_table(rows: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
+    """Return the rows of a sweep as a table of some parameters.
+
+    Args:
+        rows: of a sweep (`runs.tables.sweep_frame`); a prediction that was not judged is not right.
+        names: of parameters; the table has those that vary and that all rows have.
+    """
+    columns = dict[str, pd.Series]()
+    units = dict[str, str]()
     for name in names:
-        column, is_names = rows[name], rows[name].dtype == "category"
-        if is_names:
+        column = rows[name]
+        has_names = column.dtype == "category"
+        if has_names:
             column = column.cat.set_categories(sorted(column.unique()))
         if column.nunique() > 1 and not column.isna().any():
-            table[name], units[name] = column, "" if is_names else rows.attrs["units"][name]
-    table |= {"outcome": rows["outcome"]} if "outcome" in rows and "outcome" not in table else {}
-    found = pd.DataFrame({**table, "correct": rows["correct"] == 1, "unit": rows["unit"]})
-    found.attrs["units"] = units
-    return found
+            columns[name] = column
+            units[name] = "" if has_names else rows.attrs["units"][name]
+    if "outcome" in rows:
+        columns.setdefault("outcome", rows["outcome"])
+    table = pd.DataFrame({**columns, "correct": rows["correct"] == 1, "unit": rows["unit"]})
+    table.attrs["units"] = units
+    return table
 
 
 def is_in_view(rows: pd.DataFrame) -> Mask:
@@ -80,22 +103,29 @@ def count_wrong_outcomes(rows: pd.DataFrame) -> dict[str, int] | None:
     return counts_by_name or None
 
 
-def interval_of(table: pd.DataFrame) -> tuple[float, float]:
-    """Return the 95 % interval of `share_of`; 0 to 1 where there is no row."""
+def estimate_interval(table: pd.DataFrame) -> tuple[float, float]:
+    """Return the 95 % interval of `estimate_share`; 0 to 1 where there is no row."""
     if table.empty:
         return 0.0, 1.0
-    return share_interval(per_unit(table["correct"], table["unit"]), per_unit(np.ones(len(table)), table["unit"]))
+    return share_interval(*count_per_unit(table))
 
 
-def share_of(table: pd.DataFrame) -> float:
+def estimate_share(table: pd.DataFrame) -> float:
     """Return the mean over units of the share of right predictions of each; NaN where there is no row."""
-    return mean_share(per_unit(table["correct"], table["unit"]), per_unit(np.ones(len(table)), table["unit"]))
+    return mean_share(*count_per_unit(table))
+
+
+def count_per_unit(table: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
+    """Return the right predictions and the predictions of each unit (m,)."""
+    n_right = per_unit(table["correct"], table["unit"])
+    n_rows = per_unit(np.ones(len(table)), table["unit"])
+    return n_right, n_rows
 
 
 def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
     """Return a table in which units with a configuration in common are one unit: it is the same draw, come twice.
 
-    That is asked only where two draws are never the same by chance: where some factor is a number with at least half as
+    This is done only where two draws are never the same by chance: where some factor is a number with at least half as
     many values as there are rows. Values of a grid, and names, come again in independent draws too.
     """
     factors = list(table.attrs["units"])
@@ -106,12 +136,13 @@ def merge_repeats(table: pd.DataFrame) -> pd.DataFrame:
     n_configurations = int(configuration.max()) + 1
     if n_configurations == len(table):
         return table
-    merged = table.assign(unit=connected(np.unique(table["unit"], return_inverse=True)[1], configuration))
+    unit_index = np.unique(table["unit"], return_inverse=True)[1]
+    merged = table.assign(unit=find_connected(unit_index, configuration))
     merged.attrs = table.attrs
     return merged
 
 
-def connected(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+def find_connected(first: IntArray, second: IntArray) -> IntArray:
     """Return the group (n,) of each row: rows with the same number (n,) from 0 of either kind are in one group."""
     group = first
     while True:
@@ -125,13 +156,13 @@ def connected(first: npt.NDArray[np.int64], second: npt.NDArray[np.int64]) -> np
         group = linked
 
 
-def halves(table: pd.DataFrame, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return two halves, drawn by a seed, each of whole units: one to choose on and one to count on."""
+def split_in_halves(table: pd.DataFrame, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return two halves of the units, drawn by a seed: one to choose on and one to count on."""
     table = merge_repeats(table)
-    units, places = np.unique(table["unit"], return_inverse=True)
+    units, unit_index = np.unique(table["unit"], return_inverse=True)
     order = np.random.default_rng(seeds.stream(seed, "halves")).permutation(len(units))
-    chosen = np.isin(places, order[: len(units) // 2])
-    return table[chosen], table[~chosen]
+    is_in_first = np.isin(unit_index, order[: len(units) // 2])
+    return table[is_in_first], table[~is_in_first]
 
 
 # ---- rules ----------------------------------------------------------------------------------------------------------
@@ -139,8 +170,16 @@ def halves(table: pd.DataFrame, seed: int) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 @dataclass(frozen=True)
 class RuleCondition:
-    """A part of the values of one factor: over `low` and at most `high`, or some of its names. With a `turn`, 360 or
-    180 degrees, values repeat after it, and where `low` is over `high` the part goes through 0."""
+    """A part of the values of one factor: over `low` and at most `high`, or some of its names.
+
+    Attributes:
+        factor: its name.
+        unit: of the factor.
+        low, high: bounds of numbers.
+        options: names; None for numbers.
+        turn: 360 or 180 degrees after which values of an angle repeat; then, where `low` is over `high`, the part goes
+            through 0. Else 0.
+    """
 
     factor: str
     unit: str = ""
@@ -150,16 +189,18 @@ class RuleCondition:
     turn: float = 0.0
 
     def holds(self, table: pd.DataFrame) -> Mask:
-        """Return in which rows (n,) it does."""
+        """Return in which rows (n,) it holds."""
         column = table[self.factor]
         if self.options is not None:
             return np.asarray(column.isin(self.options))
         values = column.to_numpy()
         if self.turn:
             values = values % self.turn
-            if self.low > self.high:
-                return np.asarray((values > self.low) | (values <= self.high))
-        return np.asarray((values > self.low) & (values <= self.high))
+        is_over = values > self.low
+        is_at_most = values <= self.high
+        if self.turn and self.low > self.high:
+            return np.asarray(is_over | is_at_most)
+        return np.asarray(is_over & is_at_most)
 
     @property
     def arcs(self) -> tuple[tuple[float, float], ...]:
@@ -167,34 +208,46 @@ class RuleCondition:
         if not self.turn:
             return ()
         width = (self.high - self.low) % self.turn
-        return tuple((self.low + at, self.low + at + width) for at in np.arange(0.0, 360.0, self.turn).tolist())
+        begins = [self.low + offset for offset in np.arange(0.0, 360.0, self.turn).tolist()]
+        return tuple((begin, begin + width) for begin in begins)
 
     @property
     def row(self) -> ConditionRow:
-        unit = f" {self.unit}" if self.unit not in ("", "1") else ""
-        names, over, at_most = sorted(self.options or ()), f"over {self.low:g}", f"at most {self.high:g}"
-        bounds = [text for text, end in ((over, self.low), (at_most, self.high)) if np.isfinite(end)]
-        if self.turn:
-            bounds = [" or ".join(f"from {low % 360:g} to {high % 360:g}" for low, high in self.arcs)]
+        """What a result holds of it."""
         return ConditionRow(
             parameter=self.factor,
             unit=self.unit,
             over=self.low if np.isfinite(self.low) else None,
             at_most=self.high if np.isfinite(self.high) else None,
-            options=names,
+            options=sorted(self.options or ()),
             turn=self.turn or None,
-            text=f"{self.factor} {' or '.join(names) if names else ' and '.join(bounds) + unit}",
+            text=f"{self.factor} {self._values_text}",
         )
+
+    @property
+    def _values_text(self) -> str:
+        if self.options:
+            return " or ".join(sorted(self.options))
+        bounds = []
+        if self.turn:
+            bounds = [" or ".join(f"from {begin % 360:g} to {end % 360:g}" for begin, end in self.arcs)]
+        else:
+            if np.isfinite(self.low):
+                bounds.append(f"over {self.low:g}")
+            if np.isfinite(self.high):
+                bounds.append(f"at most {self.high:g}")
+        unit = f" {self.unit}" if self.unit not in ("", "1") else ""
+        return " and ".join(bounds) + unit
 
 
 RuleConditions = tuple[RuleCondition, ...]  # all of which hold, at most one for each factor
 
 
-def covered(conditions: RuleConditions, table: pd.DataFrame) -> Mask:
+def find_covered(conditions: RuleConditions, table: pd.DataFrame) -> Mask:
     """Return which rows (n,) lie under all conditions."""
     mask = np.ones(len(table), dtype=bool)
-    for one in conditions:
-        mask &= one.holds(table)
+    for condition in conditions:
+        mask &= condition.holds(table)
     return mask
 
 
@@ -211,181 +264,279 @@ class CountedRule:
         """By how much more often the model is right elsewhere than under it, with equal weight of all units."""
         if self.inside.empty or self.elsewhere.empty:
             return 0.0
-        return share_of(self.elsewhere) - share_of(self.inside)
+        return estimate_share(self.elsewhere) - estimate_share(self.inside)
 
     @cached_property
-    def chance(self) -> float:
+    def p_value(self) -> float:
         """The probability of so few right predictions under it, or fewer, if they were spread by chance."""
-        return self._chance(1.0)
+        return self._compute_p_value(1.0)
 
     @property
     def holds(self) -> bool:
-        """Whether it is told: rows that did not choose it show it, and more than chance would."""
-        return self.gap >= LEAST_GAP and self.chance <= CHANCE
+        """Whether rows that did not choose it show it, and more than chance would."""
+        return self.gap >= MIN_GAP and self.p_value <= SIGNIFICANCE
 
-    def times_needed(self) -> float | None:
-        """Return how many times as many rows, of the same shares, would tell it; None where no number would."""
-        times, rows = 1.0, len(self.inside) + len(self.elsewhere)
-        while self.gap >= LEAST_GAP and rows * times <= MOST_NEEDED:
-            if self._chance(times) <= CHANCE:
-                return times
-            times *= 1.05
+    def find_needed_factor(self) -> float | None:
+        """Return how many times as many rows, of the same shares, would show it; None where no number would."""
+        factor = 1.0
+        n_rows = len(self.inside) + len(self.elsewhere)
+        while self.gap >= MIN_GAP and n_rows * factor <= MAX_NEEDED:
+            if self._compute_p_value(factor) <= SIGNIFICANCE:
+                return factor
+            factor *= 1.05
         return None
 
-    def _chance(self, times: float) -> float:
-        units, right = (np.concatenate([self.inside[name], self.elsewhere[name]]) for name in ("unit", "correct"))
-        under = np.arange(len(units)) < len(self.inside)
-        k, a, r, b = (per_unit(one, units) for one in (under & right, under, ~under & right, ~under))
-        return fewer_by_chance(k, a, r, b, times)
+    def _compute_p_value(self, factor: float) -> float:
+        """Return the probability with so many times as many rows."""
+        units = np.concatenate([self.inside["unit"], self.elsewhere["unit"]])
+        is_right = np.concatenate([self.inside["correct"], self.elsewhere["correct"]])
+        is_inside = np.arange(len(units)) < len(self.inside)
+        right_inside = per_unit(is_inside & is_right, units)
+        rows_inside = per_unit(is_inside, units)
+        right_elsewhere = per_unit(~is_inside & is_right, units)
+        rows_elsewhere = per_unit(~is_inside, units)
+        return fewer_by_chance(right_inside, rows_inside, right_elsewhere, rows_elsewhere, factor)
 
 
 @dataclass(frozen=True)
 class FoundRules:
-    """The rules that are told, the weightiest first, and the best one after these, if there is one to try."""
+    """Rules, and the best one that is none.
 
-    told: list[CountedRule]
-    next: CountedRule | None
+    Attributes:
+        accepted: the rules that hold, the weightiest first.
+        best_rejected: the best one after these, if there is one to test.
+    """
+
+    accepted: list[CountedRule]
+    best_rejected: CountedRule | None
 
 
 def find_rules(choosing: pd.DataFrame, counting: pd.DataFrame, seed: int) -> FoundRules:
-    """Return the rules under which the model is wrong more often, chosen on some rows and counted on others."""
-    rules: list[CountedRule] = []
-    for number in range(MOST_RULES):
-        conditions = _best(choosing, seeds.stream(seed, "rules", number))
+    """Find rules under which the model is wrong more often, chosen on some rows and counted on others.
+
+    Raises:
+        InputError: scikit-learn is missing.
+    """
+    accepted: list[CountedRule] = []
+    for number in range(MAX_RULES):
+        conditions = find_best_conditions(choosing, seeds.stream(seed, "rules", number))
         if not conditions:
-            return FoundRules(rules, None)
-        inside = covered(conditions, counting)
+            return FoundRules(accepted, None)
+        inside = find_covered(conditions, counting)
         rule = CountedRule(conditions, counting[inside], counting[~inside])
         if not rule.holds:
-            return FoundRules(rules, rule)
-        rules.append(rule)
-        choosing, counting = choosing[~covered(conditions, choosing)], rule.elsewhere
-    return FoundRules(rules, None)
+            return FoundRules(accepted, rule)
+        accepted.append(rule)
+        choosing = choosing[~find_covered(conditions, choosing)]
+        counting = rule.elsewhere
+    return FoundRules(accepted, None)
 
 
-def _best(table: pd.DataFrame, seed: int) -> RuleConditions:
-    """The candidate of the largest weighted relative accuracy, as short as it can be; none where all are worthless."""
-    wrong = ~table["correct"].to_numpy()
-    least = max(LEAST_ROWS, round(LEAST_SHARE * len(table)))
+# ---- the best conditions --------------------------------------------------------------------------------------------
+
+
+def find_best_conditions(table: pd.DataFrame, seed: int) -> RuleConditions:
+    """Find the conditions of the largest weighted relative accuracy, and leave out what adds little to it.
+
+    There are none where no condition is worth anything.
+    """
+    n_wrong = int((~table["correct"].to_numpy()).sum())
+    min_rows = find_min_rows(table)
+    if len(table) < 2 * min_rows or not 0 < n_wrong < len(table):
+        return ()
+    scorer = ConditionScorer(table, min_rows)
+    best = max(find_candidates(table, min_rows, seed), key=scorer.score, default=())
+    if not best or scorer.score(best) <= 0.0:
+        return ()
+    return adjust_bounds(shorten_conditions(best, scorer), scorer)
+
+
+def find_min_rows(table: pd.DataFrame) -> int:
+    """Return how many rows a rule has to cover."""
+    min_rows = max(MIN_COVERED_ROWS, round(MIN_COVERED_SHARE * len(table)))
     if not table["unit"].is_unique:
-        least = max(least, round(LEAST_UNITS * len(table) / table["unit"].nunique()))
-    if len(table) < 2 * least or not 0 < int(wrong.sum()) < len(table):
-        return ()
-    excess = wrong - wrong.mean()
+        min_rows = max(min_rows, round(MIN_COVERED_UNITS * len(table) / table["unit"].nunique()))
+    return min_rows
 
-    def weight(conditions: RuleConditions) -> float:
-        mask = covered(conditions, table)
-        return float(excess[mask].sum()) / len(table) if int(mask.sum()) >= least else -1.0
 
-    best = max(_candidates(table, least, seed), key=weight, default=())
-    reached = weight(best) if best else 0.0
-    if reached <= 0.0:
-        return ()
-    while len(best) > 1:
-        shorter = max((best[:k] + best[k + 1 :] for k in range(len(best))), key=weight)
-        left_out = int((covered(shorter, table) & ~covered(best, table)).sum())
-        # the standard error of what is lost, so that few rows choose few conditions
-        error = math.sqrt(left_out * float(table["correct"].to_numpy().var())) / len(table)
-        if reached - weight(shorter) > max((1.0 - KEPT) * reached, error):
+class ConditionScorer:
+    """Scores conditions by their weighted relative accuracy in a table: of the model's being wrong."""
+
+    def __init__(self, table: pd.DataFrame, min_rows: int) -> None:
+        self.table = table
+        self._min_rows = min_rows
+        is_wrong = ~table["correct"].to_numpy()
+        self._excess = is_wrong - is_wrong.mean()
+
+    def score(self, conditions: RuleConditions) -> float:
+        """Return the score; -1 where too few rows lie under the conditions."""
+        is_covered = find_covered(conditions, self.table)
+        if int(is_covered.sum()) < self._min_rows:
+            return -1.0
+        return float(self._excess[is_covered].sum()) / len(self.table)
+
+
+def shorten_conditions(conditions: RuleConditions, scorer: ConditionScorer) -> RuleConditions:
+    """Leave conditions out, one at a time, where that costs little of their score."""
+    table = scorer.table
+    score = scorer.score(conditions)
+    variance = float(table["correct"].to_numpy().var())
+    while len(conditions) > 1:
+        candidates = [conditions[:index] + conditions[index + 1 :] for index in range(len(conditions))]
+        shorter = max(candidates, key=scorer.score)
+        n_added = int((find_covered(shorter, table) & ~find_covered(conditions, table)).sum())
+        # the standard error of the loss, so that few rows choose few conditions
+        standard_error = math.sqrt(n_added * variance) / len(table)
+        loss = score - scorer.score(shorter)
+        if loss > max((1.0 - RETAINED_ACCURACY) * score, standard_error):
             break
-        best = shorter
-    for _ in range(PASSES):
-        for place in range(len(best)):
-            moved = [(*best[:place], one, *best[place + 1 :]) for one in _moved(best[place], table)]
-            best = max([best, *moved], key=weight)
-    return best
+        conditions = shorter
+    return conditions
 
 
-def _moved(condition: RuleCondition, table: pd.DataFrame) -> Iterator[RuleCondition]:
-    """The condition with its bounds elsewhere: nodes of trees lie where the nodes above them left them."""
+def adjust_bounds(conditions: RuleConditions, scorer: ConditionScorer) -> RuleConditions:
+    """Move the bounds of conditions to where their score is largest, one condition at a time."""
+    for _ in range(N_ADJUSTMENTS):
+        for index in range(len(conditions)):
+            adjusted = [
+                (*conditions[:index], condition, *conditions[index + 1 :])
+                for condition in list_adjusted(conditions[index], scorer.table)
+            ]
+            conditions = max([conditions, *adjusted], key=scorer.score)
+    return conditions
+
+
+def list_adjusted(condition: RuleCondition, table: pd.DataFrame) -> Iterator[RuleCondition]:
+    """Yield a condition with its bounds elsewhere: nodes of trees lie where the nodes above them left them."""
     if condition.options is not None:
         return
     values = table[condition.factor].to_numpy()
-    quantiles = np.quantile(values % condition.turn if condition.turn else values, np.linspace(0, 1, BOUNDS + 1)[1:-1])
-    for at in dict.fromkeys(float(f"{one:.3g}") for one in quantiles):
-        if at in (condition.low, condition.high):
+    if condition.turn:
+        values = values % condition.turn
+    quantiles = np.quantile(values, np.linspace(0, 1, N_BOUNDS + 1)[1:-1])
+    for bound in dict.fromkeys(float(f"{quantile:.3g}") for quantile in quantiles):
+        if bound in (condition.low, condition.high):
             continue
-        if condition.low > -np.inf and (condition.turn or at < condition.high):
-            yield replace(condition, low=at)
-        if condition.high < np.inf and (condition.turn or at > condition.low):
-            yield replace(condition, high=at)
+        if condition.low > -np.inf and (condition.turn or bound < condition.high):
+            yield replace(condition, low=bound)
+        if condition.high < np.inf and (condition.turn or bound > condition.low):
+            yield replace(condition, high=bound)
+
+
+# ---- candidates from trees ------------------------------------------------------------------------------------------
 
 
 class TreeColumn(NamedTuple):
-    """What a column of the trees' data is of: a factor's values, the name that it is 1 of, an angle's zero."""
+    """What a column of the trees' data is of.
 
-    whole: RuleCondition
+    Attributes:
+        full_condition: of the factor, without bounds.
+        name: that the column is 1 of; None for numbers.
+        zero: of an angle, degrees.
+    """
+
+    full_condition: RuleCondition
     name: str | None = None
     zero: float = 0.0
 
-    def told(self, condition: RuleCondition) -> RuleCondition:
-        """A condition on the column as one on the factor."""
-        turn = self.whole.turn
+    def read_values(self, table: pd.DataFrame) -> FloatArray:
+        """Return the column's values (n,)."""
+        column = table[self.full_condition.factor]
+        if self.name is not None:
+            return np.asarray(column == self.name, np.float64)
+        values: FloatArray = column.to_numpy()
+        if self.full_condition.turn:
+            values = (values - self.zero) % self.full_condition.turn
+        return values
+
+    def to_factor(self, condition: RuleCondition) -> RuleCondition:
+        """Return a condition on the column as one on the factor."""
+        turn = self.full_condition.turn
         if not turn:
             return condition
-        low, high = max(condition.low, 0.0) + self.zero, min(condition.high, turn) + self.zero
+        low = max(condition.low, 0.0) + self.zero
+        high = min(condition.high, turn) + self.zero
         return replace(condition, low=low % turn, high=high % turn or turn)
 
 
-def _candidates(table: pd.DataFrame, least: int, seed: int) -> Iterator[RuleConditions]:
-    trees_of, forests = (import_library(f"sklearn.{part}") for part in ("tree", "ensemble"))
-    one_tree, forest = trees_of.DecisionTreeClassifier, forests.RandomForestClassifier
-    columns: list[tuple[npt.NDArray[np.float64], TreeColumn]] = []
-    for factor, unit in table.attrs["units"].items():
-        column, whole = table[factor], RuleCondition(factor, unit)
-        if column.dtype == "category":
-            names = column.cat.categories.tolist()
-            whole = replace(whole, options=frozenset(names))
-            columns += [((column == name).to_numpy(np.float64), TreeColumn(whole, name)) for name in names]
-            continue
-        columns.append((values := column.to_numpy(), TreeColumn(whole)))
-        if unit == "degrees" and np.ptp(values) >= AROUND:
-            arcs = [(replace(whole, turn=turn), zero) for turn, zero in ARCS]
-            columns += [((values - zero) % arc.turn, TreeColumn(arc, zero=zero)) for arc, zero in arcs]
-    data, right = np.stack([values for values, _ in columns], axis=1), table["correct"].to_numpy()
-    splits = [split for _, split in columns]
-    shape = {"max_depth": DEPTH, "min_samples_leaf": least}
-    alone = one_tree(**shape, random_state=seed % 2**32)
-    several = forest(TREES, **shape, max_features=0.6, random_state=seed % 2**32)
-    trees = [(one.tree_, splits) for one in (alone.fit(data, right), *several.fit(data, right).estimators_)]
-    for place, split in enumerate(splits):
-        if split.whole.turn:  # by itself too: in a tree of all columns other splits of the same angle come first
-            trees.append((one_tree(**shape).fit(data[:, [place]], right).tree_, [split]))
-    seen: set[RuleConditions] = {()}
-    for tree, own in trees:
-        for node in _nodes(tree, own):
-            factors: dict[str, list[RuleCondition]] = {name: [] for name in table.attrs["units"]}
-            for split, condition in node.items():
-                factors[condition.factor].append(split.told(condition))
-            # of several parts of one angle, each in turn: their bounds are moved later
-            for conditions in product(*filter(None, factors.values())):
-                if conditions not in seen:
-                    seen.add(conditions)
+def find_candidates(table: pd.DataFrame, min_rows: int, seed: int) -> Iterator[RuleConditions]:
+    """Yield the conditions of all nodes of trees, each once."""
+    seen_conditions: set[RuleConditions] = {()}
+    for tree, columns in grow_trees(table, min_rows, seed):
+        for node in walk_tree(tree, columns):
+            conditions_of_factor: dict[str, list[RuleCondition]] = {name: [] for name in table.attrs["units"]}
+            for column, condition in node.items():
+                conditions_of_factor[condition.factor].append(column.to_factor(condition))
+            # of several parts of one angle, each in turn: their bounds are adjusted later
+            for conditions in product(*filter(None, conditions_of_factor.values())):
+                if conditions not in seen_conditions:
+                    seen_conditions.add(conditions)
                     yield conditions
 
 
-def _nodes(tree: Any, splits: list[TreeColumn]) -> Iterator[dict[TreeColumn, RuleCondition]]:
+def list_columns(table: pd.DataFrame) -> list[TreeColumn]:
+    """Return the columns that trees have of the factors of a table."""
+    columns = []
+    for factor, unit in table.attrs["units"].items():
+        values = table[factor]
+        full_condition = RuleCondition(factor, unit)
+        if values.dtype == "category":
+            names = values.cat.categories.tolist()
+            full_condition = replace(full_condition, options=frozenset(names))
+            columns += [TreeColumn(full_condition, name) for name in names]
+            continue
+        columns.append(TreeColumn(full_condition))
+        if unit == "degrees" and np.ptp(values.to_numpy()) >= MIN_ANGLE_RANGE:
+            columns += [TreeColumn(replace(full_condition, turn=turn), zero=zero) for turn, zero in ARCS]
+    return columns
+
+
+def grow_trees(table: pd.DataFrame, min_rows: int, seed: int) -> list[tuple[Any, list[TreeColumn]]]:
+    """Return trees of scikit-learn that predict whether the model is right, and the columns of each."""
+    make_tree = import_library("sklearn.tree").DecisionTreeClassifier
+    make_forest = import_library("sklearn.ensemble").RandomForestClassifier
+    columns = list_columns(table)
+    data = np.stack([column.read_values(table) for column in columns], axis=1)
+    is_right = table["correct"].to_numpy()
+    shape = {"max_depth": MAX_CONDITIONS, "min_samples_leaf": min_rows}
+    random_state = seed % 2**32
+    single_tree = make_tree(**shape, random_state=random_state).fit(data, is_right)
+    forest = make_forest(N_TREES, **shape, max_features=0.6, random_state=random_state).fit(data, is_right)
+    trees = [(estimator.tree_, columns) for estimator in (single_tree, *forest.estimators_)]
+    for index, column in enumerate(columns):
+        if column.full_condition.turn:
+            # by itself too: in a tree of all columns other splits of the same angle come first
+            tree = make_tree(**shape).fit(data[:, [index]], is_right).tree_
+            trees.append((tree, [column]))
+    return trees
+
+
+def walk_tree(tree: Any, columns: list[TreeColumn]) -> Iterator[dict[TreeColumn, RuleCondition]]:
+    """Yield the conditions of each node of a tree, by column without a name."""
     open_nodes: list[tuple[int, dict[TreeColumn, RuleCondition]]] = [(0, {})]
     while open_nodes:
         node, conditions = open_nodes.pop()
         yield conditions
-        left, right = int(tree.children_left[node]), int(tree.children_right[node])
+        left = int(tree.children_left[node])
+        right = int(tree.children_right[node])
         if left == right:
             continue
-        split = splits[tree.feature[node]]
-        key = split._replace(name=None)
-        before = conditions.get(key, split.whole)
-        if split.name is None or before.options is None:
-            at = float(f"{tree.threshold[node]:.3g}")  # as it is told
-            below, above = replace(before, high=min(before.high, at)), replace(before, low=max(before.low, at))
+        column = columns[tree.feature[node]]
+        key = column._replace(name=None)
+        condition = conditions.get(key, column.full_condition)
+        if column.name is None or condition.options is None:
+            threshold = float(f"{tree.threshold[node]:.3g}")  # as it is reported
+            below = replace(condition, high=min(condition.high, threshold))
+            above = replace(condition, low=max(condition.low, threshold))
         else:
-            names = before.options
-            below, above = (replace(before, options=one) for one in (names - {split.name}, names & {split.name}))
-        open_nodes += [(left, {**conditions, key: below}), (right, {**conditions, key: above})]
+            below = replace(condition, options=condition.options - {column.name})
+            above = replace(condition, options=condition.options & {column.name})
+        open_nodes.append((left, {**conditions, key: below}))
+        open_nodes.append((right, {**conditions, key: above}))
 
 
 def import_library(name: str) -> Any:
-    """Return a module of scikit-learn, such as ``sklearn.tree``."""
+    """Return a module of scikit-learn, such as ``sklearn.tree``. Raises InputError: it is missing."""
     try:
         return importlib.import_module(name)
     except ImportError as error:

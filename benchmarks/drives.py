@@ -29,7 +29,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from advsearch.questions.explain.importance import find_importance
-from advsearch.rules import find_rules, halves
+from advsearch.rules import find_rules, split_in_halves
 from advsearch.statistics.clustered import fewer_by_chance, mean_interval, paired_by_unit, share_interval
 
 Floats = npt.NDArray[np.float64]
@@ -175,7 +175,7 @@ def explained(runs: int) -> int:
             for seed in range(runs):
                 rng = np.random.default_rng(seed)
                 found = observed(rng, answer(rng, drives, 0.7))
-                told += bool(find_rules(*halves(found, seed), seed=seed).told)
+                told += bool(find_rules(*split_in_halves(found, seed), seed=seed).accepted)
                 weights = {tuple(one.parameters): one.interval[0] > 0.0 for one in find_importance(found)}
                 decides += [weights.get(("pose.yaw",), False), weights.get(("path.time",), False)]
             bad += too_many(told, runs, 0.01) + sum(too_many(int(one), runs, 0.025) for one in decides)

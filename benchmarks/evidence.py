@@ -288,12 +288,12 @@ def explain(run: Path, told: dict[str, Any]) -> Counted:
     """Each rule: its fresh renders, and the rows of the half that did not choose."""
     from advsearch.questions.explain.rows import read_predictions
     from advsearch.questions.sweep.stored import StoredSweep
-    from advsearch.rules import halves, observed
+    from advsearch.rules import make_table, split_in_halves
 
     found, summary = Counted(), json.loads((run / "summary.json").read_text())
     rows = read_predictions([StoredSweep.read(Path(name)) for name in summary["sweeps"]])
     rows = rows[rows["label"] != "out of view"].reset_index(drop=True)
-    _, left = halves(observed(rows, rows.attrs["units"]), 0)
+    _, left = split_in_halves(make_table(rows, rows.attrs["units"]), 0)
     before: list[list[dict[str, Any]]] = []
     for number, rule in enumerate(summary["rules"], 1):
         found.let(number, *(one["text"] for one in rule["conditions"]))

@@ -27,7 +27,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from advsearch.questions.explain.importance import find_importance
-from advsearch.rules import CountedRule, Mask, covered, find_rules, halves, observed
+from advsearch.rules import CountedRule, Mask, find_covered, find_rules, make_table, split_in_halves
 
 Numbers = npt.NDArray[np.float64]
 
@@ -53,7 +53,7 @@ def table(values: Mapping[str, Any], right: Mask) -> pd.DataFrame:
     rows = pd.DataFrame({**values, "correct": right, "unit": np.arange(len(right))})
     rows = rows.astype({name: "category" for name in NAMES if name in values})
     rows.attrs["units"] = {name: UNITS.get(name, "") for name in values}
-    return observed(rows, values)
+    return make_table(rows, values)
 
 
 def wrong(law: str, values: Numbers) -> Mask:
@@ -153,7 +153,7 @@ def is_confirmed(
     fresh = pd.DataFrame()
     while len(fresh) < INSIDE:
         more = drawn(law, 20 * INSIDE, noise, generator, accuracy)
-        fresh = pd.concat([fresh, more[covered(rule.conditions, more)]])
+        fresh = pd.concat([fresh, more[find_covered(rule.conditions, more)]])
     fresh = fresh[:INSIDE].assign(unit=-1 - np.arange(INSIDE))
     return CountedRule(rule.conditions, fresh, rule.elsewhere).holds
 
@@ -163,7 +163,7 @@ def without_a_law(studies: int, rows: int) -> int:
     told = confirmed = 0
     for seed in range(studies):
         generator = np.random.default_rng(10_000 + seed)
-        found = find_rules(*halves(drawn("none", rows, 0.0, generator, 0.7), seed), seed=seed).told
+        found = find_rules(*split_in_halves(drawn("none", rows, 0.0, generator, 0.7), seed), seed=seed).accepted
         told += bool(found)
         confirmed += any(is_confirmed(one, "none", 0.0, generator, 0.7) for one in found)
     most = 0.01 * studies + 3.0 * (0.0099 * studies) ** 0.5
@@ -184,7 +184,7 @@ def main() -> int:
         begun, told, rules, confirmed = time.process_time(), 0, 0, 0
         for seed in range(args.seeds):
             generator = np.random.default_rng(seed)
-            found = find_rules(*halves(drawn(law, args.rows, args.noise, generator), seed), seed=seed).told
+            found = find_rules(*split_in_halves(drawn(law, args.rows, args.noise, generator), seed), seed=seed).accepted
             told, rules = told + is_told(law, found), rules + len(found)
             confirmed += sum(is_confirmed(one, law, args.noise, generator) for one in found)
         seconds = (time.process_time() - begun) / args.seeds

@@ -18,7 +18,7 @@ from advsearch.options import Value
 from advsearch.questions.photographs.pages import PhotographPages
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.rules import observed
+from advsearch.rules import make_table
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
@@ -103,4 +103,4 @@ def seen(values: Mapping[str, Any], right: Any, units: Any = None, of: Mapping[s
     columns = {name: one if one.dtype.kind == "f" else one.astype("category") for name, one in columns.items()}
     rows = pd.DataFrame({**columns, "correct": right, "unit": np.arange(len(right)) if units is None else units})
     rows.attrs["units"] = {**dict.fromkeys(values, ""), **(of or {})}
-    return observed(rows, values)
+    return make_table(rows, values)

@@ -307,7 +307,7 @@ FAULTS = (
         "explain: a rule is counted on the rows that chose it",
         "advsearch/rules.py",
         "rule = CountedRule(conditions, counting[inside], counting[~inside])",
-        "rule = CountedRule(conditions, choosing[covered(conditions, choosing)], choosing)",
+        "rule = CountedRule(conditions, choosing[find_covered(conditions, choosing)], choosing)",
         ("tests/questions/test_rules.py",),
     ),
     Fault(

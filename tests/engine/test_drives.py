@@ -19,7 +19,7 @@ from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.journal import worker_call
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
-from advsearch.questions.explain.renders import AskedSweep, read_predictions
+from advsearch.questions.explain.rows import read_predictions
 from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.carry_out import job_of
 from advsearch.questions.sweep.display import claims, rate_text
@@ -27,6 +27,7 @@ from advsearch.questions.sweep.drives import Drives, longest, over_drives, plann
 from advsearch.questions.sweep.job import OpenScenes
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
+from advsearch.questions.sweep.stored import StoredSweep
 from advsearch.questions.sweep.summary import DriveRates
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.tables import read_sweep
@@ -292,12 +293,12 @@ def test_repeats_of_points_of_a_grid_that_differ_in_noise_are_as_many_points(
     assert "Intervals are over 4 drives" in " ".join(result.summary.warnings)
 
 
-def swept_parts(folder: Path, *settings: dict[str, Any]) -> list[AskedSweep]:
+def swept_parts(folder: Path, *settings: dict[str, Any]) -> list[StoredSweep]:
     """Sweep with each of some settings, as what `explain` reads."""
     paths = [folder / f"part-{number}" for number in range(len(settings))]
     for path, given in zip(paths, settings, strict=True):
         advsearch.sweep("mug", **SMALL, **given, run=path)
-    return [AskedSweep.of(path) for path in paths]
+    return [StoredSweep.read(path) for path in paths]
 
 
 def test_pictures_of_a_longer_sweep_of_the_same_seed_are_not_counted_twice(tmp_path: Path) -> None:

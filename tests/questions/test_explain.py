@@ -27,7 +27,15 @@ from advsearch.questions.explain.rows import read_predictions
 from advsearch.questions.explain.sweeps import is_settable, sweep_along, sweep_inside
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.sweep.stored import StoredSweep
-from advsearch.rules import CountedRule, RuleCondition, covered, find_rules, halves, merge_repeats, observed
+from advsearch.rules import (
+    CountedRule,
+    RuleCondition,
+    find_covered,
+    find_rules,
+    make_table,
+    merge_repeats,
+    split_in_halves,
+)
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.summary import read_result
@@ -162,7 +170,7 @@ def test_fresh_pictures_vary_as_the_sweep_did_and_count_beyond_the_rules_before(
 
     monkeypatch.setattr(explaining.Renders, "render_rows", rendered)
     rows = read_predictions([StoredSweep.read(swept)])
-    whole = observed(rows, rows.attrs["units"])
+    whole = make_table(rows, rows.attrs["units"])
     below, above = whole["camera.elevation"] <= 50, whole["camera.elevation"] > 70
     rules = [
         CountedRule((RuleCondition("camera.elevation", low=70.0),), whole[above], whole[~above]),
@@ -285,7 +293,7 @@ def test_a_sweep_inside_conditions_keeps_what_they_leave() -> None:
     assert made.grid == {"pose.yaw": [90.0, 180.0]} and made.environment == "studio" and made.samples == 10
     assert made.controls == {"light": {"power": [0.5, 1.0]}} and made.seed == 7 and made.spp == config.spp
     fresh = pd.DataFrame({"pose.yaw": 90.0, "environment": ["studio", "noon"], "light.power": 0.7})
-    assert covered(conditions, fresh).tolist() == [True, False]
+    assert find_covered(conditions, fresh).tolist() == [True, False]
 
 
 def test_a_sweep_along_a_factor_keeps_the_rest() -> None:
@@ -393,9 +401,9 @@ def test_a_table_in_which_rows_come_twice_tells_no_rule_by_that() -> None:
         twice.attrs["units"] = {"camera.elevation": "degrees", "light.power": "1"}
         merged = merge_repeats(twice)
         assert merged["unit"].nunique() == 200 and (merged["unit"][:100] == merged["unit"][200:].to_numpy()).all()
-        choosing, counting = halves(twice, seed)
+        choosing, counting = split_in_halves(twice, seed)
         assert not {*choosing["light.power"]} & {*counting["light.power"]}
-        told += bool(find_rules(choosing, counting, seed).told)
+        told += bool(find_rules(choosing, counting, seed).accepted)
     assert told <= 1
 
 

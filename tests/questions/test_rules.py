@@ -14,7 +14,15 @@ from advsearch.errors import InputError
 from advsearch.questions.explain.clusters import find_clusters
 from advsearch.questions.explain.envelope import find_envelope
 from advsearch.questions.explain.importance import find_importance
-from advsearch.rules import CountedRule, RuleCondition, covered, find_rules, halves, import_library, interval_of
+from advsearch.rules import (
+    CountedRule,
+    RuleCondition,
+    estimate_interval,
+    find_covered,
+    find_rules,
+    import_library,
+    split_in_halves,
+)
 
 NOISE = 0.05
 """Share of the answers that are turned round."""
@@ -47,7 +55,7 @@ def counts(rule: CountedRule) -> tuple[int, int, int, int]:
 
 
 def test_a_planted_rule_is_told() -> None:
-    (rule,) = find_rules(*halves(planted("dim from above"), 0), seed=0).told
+    (rule,) = find_rules(*split_in_halves(planted("dim from above"), 0), seed=0).accepted
     elevation, power = rule.conditions
     assert (elevation.factor, power.factor) == ("camera.elevation", "light.power")
     assert elevation.low == pytest.approx(60.0, abs=2.0) and elevation.high == np.inf
@@ -57,11 +65,11 @@ def test_a_planted_rule_is_told() -> None:
 
 
 def test_a_rule_names_options() -> None:
-    assert told(find_rules(*halves(planted("red"), 0), seed=0).told) == ["colour red"]
+    assert told(find_rules(*split_in_halves(planted("red"), 0), seed=0).accepted) == ["colour red"]
 
 
 def test_two_parameters_that_matter_only_together_are_told_as_two_rules() -> None:
-    first, second = find_rules(*halves(planted("either but not both"), 1), seed=0).told
+    first, second = find_rules(*split_in_halves(planted("either but not both"), 1), seed=0).accepted
     assert (
         {one.factor for one in first.conditions}
         == {one.factor for one in second.conditions}
@@ -70,18 +78,19 @@ def test_two_parameters_that_matter_only_together_are_told_as_two_rules() -> Non
             "camera.distance",
         }
     )
-    assert not (covered(first.conditions, planted("red")) & covered(second.conditions, planted("red"))).mean() > 0.03
+    under_first, under_second = (find_covered(rule.conditions, planted("red")) for rule in (first, second))
+    assert (under_first & under_second).mean() <= 0.03
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_no_rule_is_told_where_there_is_none(seed: int) -> None:
-    assert find_rules(*halves(planted("none", seed), seed), seed=seed).told == []
+    assert find_rules(*split_in_halves(planted("none", seed), seed), seed=seed).accepted == []
 
 
 def test_predictions_that_are_all_the_same_have_no_rule() -> None:
     found = planted("none")
     same = found.assign(correct=True)
-    assert find_rules(*halves(same, 0), seed=0).told == [] and find_importance(same) == []
+    assert find_rules(*split_in_halves(same, 0), seed=0).accepted == [] and find_importance(same) == []
 
 
 def around(law: str, seed: int, rows: int = 2000) -> pd.DataFrame:
@@ -102,7 +111,7 @@ def around(law: str, seed: int, rows: int = 2000) -> pd.DataFrame:
 @pytest.mark.parametrize("seed", range(2))
 def test_an_angle_that_goes_round_has_rules_through_0_and_of_both_ends(seed: int) -> None:
     front, end_on, far = (
-        find_rules(*halves(around(law, seed), seed), seed=seed).told[0].conditions
+        find_rules(*split_in_halves(around(law, seed), seed), seed=seed).accepted[0].conditions
         for law in ("in front", "end-on", "end-on and far")
     )
     for (found, *_), expected in ((front, (360, 335, 25)), (end_on, (180, 160, 20))):
@@ -110,7 +119,7 @@ def test_an_angle_that_goes_round_has_rules_through_0_and_of_both_ends(seed: int
     assert len(front) == len(end_on) == 1
     assert [one.factor for one in far] == ["camera.azimuth", "camera.distance"] and far[0].turn == 180.0
     assert far[1].low == pytest.approx(30, abs=6)
-    assert find_rules(*halves(around("none", seed), seed), seed=seed).told == []
+    assert find_rules(*split_in_halves(around("none", seed), seed), seed=seed).accepted == []
 
 
 def test_where_an_arc_holds() -> None:
@@ -134,19 +143,19 @@ def test_few_rows_tell_a_clear_rule_and_say_how_many_a_faint_one_takes() -> None
         right = generator.random(count) < np.where(yaw < 37.5, 0.28, 0.71)
         return seen({"pose.yaw": yaw, "camera.distance": distance, "environment": names}, right)
 
-    found = [find_rules(*halves(rows(120, seed), seed), seed=seed) for seed in range(8)]
-    told = [one.told[0] for one in found if one.told]
+    found = [find_rules(*split_in_halves(rows(120, seed), seed), seed=seed) for seed in range(8)]
+    told = [one.accepted[0] for one in found if one.accepted]
     assert 3 <= len(told) < 8 and all({one.factor for one in rule.conditions} == {"pose.yaw"} for rule in told)
     for one in found:
-        if not one.told:
-            assert one.next is not None and not one.next.holds
-    needed = [one.next.times_needed() for one in found if not one.told and one.next]
+        if not one.accepted:
+            assert one.best_rejected is not None and not one.best_rejected.holds
+    needed = [one.best_rejected.find_needed_factor() for one in found if not one.accepted and one.best_rejected]
     assert all(times is None or times > 1.0 for times in needed) and any(needed)
     exact = fisher_exact([[7, 18], [25, 10]], alternative="less").pvalue
-    assert ruled(7, 25, 25, 35).chance == pytest.approx(exact)
+    assert ruled(7, 25, 25, 35).p_value == pytest.approx(exact)
     assert ruled(7, 25, 25, 35).holds and not ruled(10, 25, 20, 35).holds
-    assert ruled(10, 25, 20, 35).times_needed() == pytest.approx(3.5, abs=0.5)
-    assert ruled(20, 25, 20, 35).times_needed() is None, "it is right more often there"
+    assert ruled(10, 25, 20, 35).find_needed_factor() == pytest.approx(3.5, abs=0.5)
+    assert ruled(20, 25, 20, 35).find_needed_factor() is None, "it is right more often there"
 
 
 def ruled(right: int, of: int, others: int, rest: int) -> CountedRule:
@@ -210,12 +219,12 @@ def test_intervals_of_what_decides_hold(accuracy: tuple[float, ...], rows: int) 
 
 
 def test_the_envelope_leaves_out_what_fails_and_little_else() -> None:
-    box = find_envelope(*halves(planted("red"), 0), accuracy=0.9)
+    box = find_envelope(*split_in_halves(planted("red"), 0), accuracy=0.9)
     assert box is not None and box.held and box.interval[0] >= 0.9
     assert [one.text for one in box.conditions] == ["colour blue or green"]
-    whole = find_envelope(*halves(planted("none"), 0), accuracy=0.9)
+    whole = find_envelope(*split_in_halves(planted("none"), 0), accuracy=0.9)
     assert whole is not None and whole.held and whole.conditions == []
-    assert find_envelope(*halves(planted("red"), 0), accuracy=0.99) is None
+    assert find_envelope(*split_in_halves(planted("red"), 0), accuracy=0.99) is None
 
 
 def test_a_table_is_what_varies_and_all_rows_have() -> None:
@@ -242,27 +251,29 @@ def of_drives(seed: int, drives: int = 40, frames: int = 10, twice: bool = False
 def test_where_drives_differ_by_themselves_nothing_is_told(twice: bool) -> None:
     """Counted row by row, a rule is told in about a half of these and a parameter decides in nearly all."""
     found = [of_drives(seed, *((120, 2) if twice else (40, 10)), twice=twice) for seed in range(40)]
-    rules = [find_rules(*halves(one, seed), seed=seed).told for seed, one in enumerate(found[:10])]
+    rules = [find_rules(*split_in_halves(one, seed), seed=seed).accepted for seed, one in enumerate(found[:10])]
     assert sum(map(bool, rules)) <= 1
     decides = [one.interval[0] > 0.0 for each in found for one in find_importance(each) if len(one.parameters) == 1]
     assert np.mean(decides) < 0.08  # 2.5 % each
-    assert all(find_envelope(*halves(one, 0), accuracy=0.95) is None for one in found[:10])
+    assert all(find_envelope(*split_in_halves(one, 0), accuracy=0.95) is None for one in found[:10])
 
 
 def test_a_law_over_drives_is_told_and_its_intervals_are_over_drives() -> None:
     given = of_drives(0, drives=160)
     found = given.assign(correct=(given["pose.yaw"] <= 0.6) | (given["path.time"] <= 0.5))
-    (rule,) = find_rules(*halves(found, 0), seed=0).told
+    (rule,) = find_rules(*split_in_halves(found, 0), seed=0).accepted
     assert {one.factor for one in rule.conditions} == {"pose.yaw", "path.time"} and not rule.inside["correct"].any()
-    assert interval_of(rule.inside)[1] > 2 * 3.7 / len(rule.inside), "an interval of as many rows would end sooner"
+    assert estimate_interval(rule.inside)[1] > 2 * 3.7 / len(rule.inside), (
+        "an interval of as many rows would end sooner"
+    )
     assert find_importance(found)[0].interval[0] > 0.05
 
 
 def test_halves_are_of_whole_units_and_share_none() -> None:
-    one, other = (set(half["unit"]) for half in halves(of_drives(3, drives=9), 1))
+    one, other = (set(half["unit"]) for half in split_in_halves(of_drives(3, drives=9), 1))
     assert (len(one), len(other)) == (4, 5) and not one & other
     rows = planted("none", rows=11)
-    first, second = halves(rows, 3)
+    first, second = split_in_halves(rows, 3)
     assert (len(first), len(second)) == (5, 6) and {*first.index, *second.index} == {*rows.index}
 
 

@@ -184,8 +184,8 @@ def count_side(side: Side) -> ComparedSide:
         **side.labels,
         configurations=len(side.rows),
         correct=int(side.is_right.sum()),
-        accuracy=rules.share_of(side.rows),
-        interval=rules.interval_of(side.rows),
+        accuracy=rules.estimate_share(side.rows),
+        interval=rules.estimate_interval(side.rows),
         outcomes=rules.count_wrong_outcomes(side.rows),
         seconds=float(side.rows["seconds"].mean()),
     )

@@ -42,7 +42,7 @@ def compare_sides(first: Side, second: Side, seed: int, *, with_rules: bool = Tr
     only_second = ~first.is_right & second.is_right
     worse = better = None
     if with_rules:
-        table = rules.observed(first.rows, shared)
+        table = rules.make_table(first.rows, shared)
         worse = find_pair_rules(table.assign(correct=~only_first), seed)
         better = find_pair_rules(table.assign(correct=~only_second), seed)
     return ComparedPair(
@@ -110,9 +110,9 @@ def find_pair_rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
         table: of pairs (`rules`); `correct` is False where that side alone is right.
         seed: of the halves that choose and count.
     """
-    if len(table) < rules.FEWEST_ROWS or not table.attrs["units"]:
+    if len(table) < rules.MIN_ROWS or not table.attrs["units"]:
         return None
-    choosing, counting = rules.halves(table, seed)
+    choosing, counting = rules.split_in_halves(table, seed)
     found_rules = rules.find_rules(choosing, counting, seeds.stream(seed, "compare"))
     return [
         PairRule(
@@ -120,13 +120,13 @@ def find_pair_rules(table: pd.DataFrame, seed: int) -> list[PairRule] | None:
             elsewhere=count_exceptions(rule.elsewhere),
             **vars(count_exceptions(rule.inside)),
         )
-        for rule in found_rules.told
+        for rule in found_rules.accepted
     ]
 
 
 def count_exceptions(pairs: pd.DataFrame) -> CountOf:
     """Count the pairs that are not `correct`, with the interval of their share."""
-    lower, upper = rules.interval_of(pairs)
-    share = None if pairs.empty else 1.0 - rules.share_of(pairs)
+    lower, upper = rules.estimate_interval(pairs)
+    share = None if pairs.empty else 1.0 - rules.estimate_share(pairs)
     n_exceptions = int((~pairs["correct"]).sum())
     return CountOf(count=n_exceptions, total=len(pairs), interval=(1.0 - upper, 1.0 - lower), share=share)

@@ -97,15 +97,15 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     sweeps = [workbench.StoredSweep.read(folder) for folder in folders]
     rows = read_predictions(sweeps)
     rows = rows[rules.is_in_view(rows)].reset_index(drop=True)
-    if len(rows) < rules.FEWEST_ROWS:
+    if len(rows) < rules.MIN_ROWS:
         raise InputError(
-            f"explain: expected at least {rules.FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations"
+            f"explain: expected at least {rules.MIN_ROWS} rows, got {len(rows)}; sweep more configurations"
         )
-    table = rules.observed(rows, rows.attrs["units"])
+    table = rules.make_table(rows, rows.attrs["units"])
     if not table.attrs["units"]:
         raise InputError("explain: expected rows in which something varies that all of them have, got none")
 
-    choosing, counting = rules.halves(table, config.seed)
+    choosing, counting = rules.split_in_halves(table, config.seed)
     progress.stage("seeking rules on one half of the rows")
     found_rules = rules.find_rules(choosing, counting, config.seed)
     progress.stage("measuring which parameters matter")
@@ -114,10 +114,10 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
 
     renders = Renders(context, sweeps, rows, table)
     rule_rows = [
-        RuleRow(**findings.describe_rule(rule), confirmed=renders.confirm_rule(found_rules.told, index))
-        for index, rule in enumerate(found_rules.told)
+        RuleRow(**findings.describe_rule(rule), confirmed=renders.confirm_rule(found_rules.accepted, index))
+        for index, rule in enumerate(found_rules.accepted)
     ]
-    pairs = list(renders.find_pairs(found_rules.told))
+    pairs = list(renders.find_pairs(found_rules.accepted))
     clusters = renders.find_clusters()
     if renders.interrupted:
         context.ending = results.INTERRUPTED
@@ -132,7 +132,7 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
         **vars(findings.count_right(table)),
         units=None if table["unit"].is_unique else table["unit"].nunique(),
         rules=rule_rows,
-        not_told=findings.describe_rejected(found_rules.next, len(table)),
+        not_told=findings.describe_rejected(found_rules.best_rejected, len(table)),
         importance=importance,
         envelope=envelope,
         pairs=pairs,

@@ -35,13 +35,13 @@ def find_envelope(choosing: pd.DataFrame, counting: pd.DataFrame, accuracy: floa
     required = min(accuracy + RESERVE, (1.0 + accuracy) / 2.0)
     box: rules.RuleConditions = ()
     inside = choosing
-    while rules.interval_of(inside)[0] < required:
+    while rules.estimate_interval(inside)[0] < required:
         smaller_box = find_best_peel(box, inside, choosing)
         if smaller_box is None:
             return None
         box = smaller_box
-        inside = choosing[rules.covered(box, choosing)]
-    counts = count_right(counting[rules.covered(box, counting)])
+        inside = choosing[rules.find_covered(box, choosing)]
+    counts = count_right(counting[rules.find_covered(box, counting)])
     conditions = [condition.row for condition in box]
     is_held = counts.interval[0] >= accuracy
     return EnvelopeRow(conditions=conditions, **vars(counts), accuracy=accuracy, held=is_held)
@@ -55,7 +55,7 @@ def find_best_peel(
     best_box = None
     best_accuracy = -1.0
     for smaller_box in peel(box, inside):
-        rest = choosing[rules.covered(smaller_box, choosing)]
+        rest = choosing[rules.find_covered(smaller_box, choosing)]
         n_draws = len(rest) if is_independent else rest["unit"].nunique()
         if n_draws >= MIN_INSIDE and rest["correct"].mean() > best_accuracy:
             best_box = smaller_box

@@ -17,8 +17,8 @@ def count_right(rows: pd.DataFrame) -> RightOf:
     return RightOf(
         right=int(rows["correct"].sum()),
         total=len(rows),
-        interval=rules.interval_of(rows),
-        share=None if rows.empty else rules.share_of(rows),
+        interval=rules.estimate_interval(rows),
+        share=None if rows.empty else rules.estimate_share(rows),
         outcomes=rules.count_wrong_outcomes(rows),
     )
 
@@ -33,9 +33,9 @@ def describe_rejected(rule: rules.CountedRule | None, n_rows: int) -> RuleNotTol
     """Return the result of a rule that is not told, found in so many rows."""
     if rule is None:
         return None
-    times = rule.times_needed()
+    times = rule.find_needed_factor()
     n_needed = None if times is None else round_up(times * n_rows)
-    return RuleNotTold(**describe_rule(rule), chance=rule.chance, asked=rules.CHANCE, rows=n_needed)
+    return RuleNotTold(**describe_rule(rule), chance=rule.p_value, asked=rules.SIGNIFICANCE, rows=n_needed)
 
 
 def round_up(count: float) -> int:
@@ -53,7 +53,7 @@ def find_cautions(table: pd.DataFrame, importance: Sequence[ParameterWeight]) ->
             "The rows are of one draw: a single drive, or pictures that differ in noise alone. The shares are of this "
             "one, and nothing is shown of others."
         )
-    elif n_draws < rules.FEWEST_ROWS:
+    elif n_draws < rules.MIN_ROWS:
         cautions.append(
             f"The rows are of {n_draws} draws, each with several, which are not independent: few show little."
         )

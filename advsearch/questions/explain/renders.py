@@ -99,7 +99,7 @@ class Renders:
             return None
         rule = counted_rules[index]
         earlier_conditions = [earlier.conditions for earlier in counted_rules[:index]]
-        covered_rows = self.table[rules.covered(rule.conditions, self.table)]
+        covered_rows = self.table[rules.find_covered(rule.conditions, self.table)]
         rest = max(float(is_outside(earlier_conditions, covered_rows).mean()), MIN_REST)
 
         fresh_frames = []
@@ -116,7 +116,7 @@ class Renders:
                 rows = self.render_rows(f"rule-{index + 1}-{sweep_index}{suffix}", config)
                 if rows is None:
                     continue
-                is_inside = rules.covered(rule.conditions, rows) & is_outside(earlier_conditions, rows)
+                is_inside = rules.find_covered(rule.conditions, rows) & is_outside(earlier_conditions, rows)
                 inside = rows[is_inside & rules.is_in_view(rows)]
                 fresh_frames.append(inside.assign(unit=inside["unit"].astype(str) + f" of {part}"))
 
@@ -279,7 +279,7 @@ def is_outside(rule_conditions: Sequence[rules.RuleConditions], rows: pd.DataFra
     """Return which rows (n,) lie under none of some rules."""
     mask = np.ones(len(rows), np.bool_)
     for conditions in rule_conditions:
-        mask &= ~rules.covered(conditions, rows)
+        mask &= ~rules.find_covered(conditions, rows)
     return mask
 
 
@@ -297,7 +297,7 @@ def find_typical_failures(
     is_left: rules.Mask = ~table["correct"].to_numpy()
     queues = []
     for conditions in (*(rule.conditions for rule in counted_rules), ()):
-        indices = np.flatnonzero(is_left & rules.covered(conditions, table))
+        indices = np.flatnonzero(is_left & rules.find_covered(conditions, table))
         is_left[indices] = False
         if not len(indices):
             continue

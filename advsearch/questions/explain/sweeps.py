@@ -31,7 +31,7 @@ def sweep_inside(
         seed: of the draws.
         arc: of an angle that may lie on either side, the index of the side.
     """
-    inside = table[rules.covered(conditions, table)]
+    inside = table[rules.find_covered(conditions, table)]
     values_inside = {name: sorted(inside[name].unique().tolist()) for name in table.attrs["units"]}
 
     outer = {name: getattr(config, name) for name in OUTER}
