@@ -10,12 +10,12 @@ import yaml
 from stored_sweeps import make_sweep
 
 import advsearch
+from advsearch import experiment
 from advsearch.cli.flags import IN_A_FILE as COMMANDS
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
-from advsearch.questions.attack import studies
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep import carry_out as sweeping
 from advsearch.questions.sweep.settings import SweepConfig
@@ -189,10 +189,10 @@ def test_a_part_has_the_workers_of_who_asks(monkeypatch: pytest.MonkeyPatch) -> 
     text = (path / "run.yaml").read_text()
     (path / "run.yaml").write_text(text.replace("workers: null", "workers: 1").replace("log: null", "log: wandb"))
     seen: list[Any] = []
-    monkeypatch.setattr(studies, "run_experiment", lambda config, **_: seen.append(config))
+    monkeypatch.setattr(experiment, "run_experiment", lambda config, **_: seen.append(config))
     for workers in (3, None):
         asked = SweepConfig(object="mug", grid={"pose.yaw": [0.0]}, workers=workers)
-        studies.carry_out_part(path, asked, NullProgress())
+        experiment.run_part(path, asked, NullProgress())
     assert [(one.workers, one.log) for one in seen] == [(3, None), (None, None)]
 
 

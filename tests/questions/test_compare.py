@@ -301,7 +301,7 @@ def test_a_comparison_that_was_stopped_goes_on(
         stored(path, {"a": good, "b": low})
         return sweep(ending="finished")
 
-    monkeypatch.setattr("advsearch.questions.attack.studies.carry_out_part", swept)
+    monkeypatch.setattr("advsearch.experiment.run_part", swept)
     line = ["compare", "a", "b", "--object", "mug", "--control", "camera", "--pictures", "0"]
     assert main([*line, "--run", str(tmp_path / "run")]) == 130
     assert f"Go on with: advsearch resume {tmp_path / 'run'}" in capsys.readouterr().out
