@@ -66,7 +66,9 @@ class TextureLesson(Lesson):
     def picture(self, u: Tensor) -> Tensor:
         """Return the picture (H, W, 3) of a texture, with a graph."""
         inputs = self.space.inputs(u)
-        return self.linear.shown({name: inputs[name] for name in self.linear.there}, torch.cat([u, self.numbers]))
+        moved = {name: inputs[name] for name in self.linear.there}
+        image: Tensor = self.linear.shown(moved, torch.cat([u, self.numbers]))
+        return image
 
     @property
     def worst(self) -> Tensor:

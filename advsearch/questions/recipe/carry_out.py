@@ -208,7 +208,7 @@ def around(config: SceneConfig, distribution: Any, searched: Mapping[str, Any]) 
         control, _, parameter = name.partition(".")
         declared = next(known for known in workbench.CONTROLS[control].parameters if known.name == parameter)
         ends = searched[name].low, searched[name].high, mean.value
-        low, high, at = (math.log(value) if declared.log else float(value) for value in ends)  # type: ignore[arg-type]
+        low, high, at = (math.log(value) if declared.log else float(value) for value in ends)
         wide = math.sqrt(3.0) * deviation * (high - low)
         if declared.periodic and high - low >= TURN:
             drawn = [at - min(wide, TURN / 2), at + min(wide, TURN / 2)]

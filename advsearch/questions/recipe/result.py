@@ -17,6 +17,7 @@ from advsearch.extend import (
     RunResult,
     SceneConfig,
     ShownResult,
+    SweepConfig,
     setting,
     setting_as_in,
     settings,
@@ -26,6 +27,9 @@ from advsearch.extend import (
 Cell = str | int | float | None
 
 NAMED = "what the recipe names"
+
+
+SCENE_SETTINGS: Any = SceneConfig  # whose validators check the settings of the same names
 
 
 class RecipeConfig(Config):
@@ -45,10 +49,7 @@ class RecipeConfig(Config):
         None, "recipe", "photographs to compare with renderings, of each object in a folder of its name", "a folder",
         otherwise="those taken with advsearch dashboard",
     )
-    object: str | None = setting_as_in(
-        SceneConfig, "object", default=None, otherwise=NAMED,
-        description="the object that the model should recognise; several, separated by commas",
-    )
+    object: str | None = setting_as_in(SweepConfig, "object", default=None, otherwise=NAMED)
     environment: str | None = setting_as_in(
         SceneConfig, "environment", otherwise=NAMED,
         description="the environment map that lights the scene; several, separated by commas",
@@ -86,13 +87,13 @@ class RecipeConfig(Config):
 
     _named = field_validator(
         "recipe", "photographs", "object", "environment", "model", "labels", "task", "run", mode="before"
-    )(lambda value, info: SceneConfig._as_text(value, info))
-    _prompts = field_validator("prompt", mode="before")(lambda value: SceneConfig._prompts_as_text(value))
-    _range = field_validator("value_range", mode="before")(lambda value: SceneConfig._range_from_text(value))
-    _range_in_order = field_validator("value_range")(lambda value: SceneConfig._range_in_order(value))
-    _sized = field_validator("resolution", mode="before")(lambda value: SceneConfig._resolution_from_text(value))
-    _sides_in_range = field_validator("resolution")(lambda value: SceneConfig._sides_in_range(value))
-    _task = field_validator("task", mode="before")(lambda value: SceneConfig._task_with_options(value))
+    )(lambda value, info: SCENE_SETTINGS._as_text(value, info))
+    _prompts = field_validator("prompt", mode="before")(lambda value: SCENE_SETTINGS._prompts_as_text(value))
+    _range = field_validator("value_range", mode="before")(lambda value: SCENE_SETTINGS._range_from_text(value))
+    _range_in_order = field_validator("value_range")(lambda value: SCENE_SETTINGS._range_in_order(value))
+    _sized = field_validator("resolution", mode="before")(lambda value: SCENE_SETTINGS._resolution_from_text(value))
+    _sides_in_range = field_validator("resolution")(lambda value: SCENE_SETTINGS._sides_in_range(value))
+    _task = field_validator("task", mode="before")(lambda value: SCENE_SETTINGS._task_with_options(value))
 
     @field_validator("photographs")
     @classmethod
