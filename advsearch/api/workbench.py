@@ -21,6 +21,8 @@ from advsearch.api.keywords import configured as configured
 from advsearch.attacks import Query as Query
 from advsearch.attacks.verification import LEAST_RATE as LEAST_RATE
 from advsearch.attacks.verification import OVER_CONDITIONS as OVER_CONDITIONS
+from advsearch.calls import helped as helped
+from advsearch.config import DEFAULT_ENVIRONMENT as DEFAULT_ENVIRONMENT
 from advsearch.controls import CONTROLS as CONTROLS
 from advsearch.engine.image_changes import AWAY as AWAY
 from advsearch.engine.image_changes import as_claimed as as_claimed
@@ -28,12 +30,17 @@ from advsearch.engine.image_changes import changed as changed
 from advsearch.engine.journal import Journal as Journal
 from advsearch.engine.journal import Shared as Shared
 from advsearch.engine.journal import worker_call as worker_call
+from advsearch.engine.judging import judgements as judgements
+from advsearch.engine.naming import in_turn as in_turn
 from advsearch.engine.record import control_group as control_group
+from advsearch.engine.record import judged as judged
 from advsearch.engine.record import verified_rate as verified_rate
 from advsearch.engine.verifier import RetrialCondition as RetrialCondition
 from advsearch.engine.verifier import Retrials as Retrials
 from advsearch.engine.verifier import kept_configuration as kept_configuration
 from advsearch.engine.verifier import ladder_of as ladder_of
+from advsearch.options import FROM_RUN as FROM_RUN
+from advsearch.options import Value as Value
 from advsearch.options import count_outcomes as count_outcomes
 from advsearch.progress import Watched as Watched
 from advsearch.progress import watcher as watcher
@@ -42,20 +49,28 @@ from advsearch.questions.attack.carry_out import ROLES_IN_SEARCH as ROLES_IN_SEA
 from advsearch.questions.attack.carry_out import AttackParts as AttackParts
 from advsearch.questions.attack.carry_out import check_from_config as check_from_config
 from advsearch.questions.attack.carry_out import executor_for as executor_for
+from advsearch.questions.attack.carry_out import judged_alone as judged_alone
 from advsearch.questions.attack.carry_out import parts_in as parts_in
 from advsearch.questions.attack.carry_out import parts_of as parts_of
+from advsearch.questions.attack.carry_out import problem_from_config as problem_from_config
 from advsearch.questions.attack.carry_out import problem_of_parts as problem_of_parts
 from advsearch.questions.attack.carry_out import problem_on as problem_on
 from advsearch.questions.attack.result import AttackResult as AttackResult
 from advsearch.questions.attack.summary import AttackSummary as AttackSummary
 from advsearch.questions.attack.summary import attack_of as attack_of
+from advsearch.questions.sweep.carry_out import scenes_of as scenes_of
 from advsearch.registry import get_experiment as get_experiment
 from advsearch.registry import imported
+from advsearch.runs.store import Row as Row
 from advsearch.scene.assembly import posed as posed
 from advsearch.scene.glb import glb as glb
 from advsearch.scene.grounds import paved as paved
 from advsearch.scene.importing.files import last_line as last_line
 from advsearch.scene.renderer import MAX_SPP as MAX_SPP
+from advsearch.tasks import AnyTask as AnyTask
+from advsearch.tasks import make_task as make_task
+from advsearch.tasks.base import Truth as Truth
+from advsearch.tasks.together import Together as Together
 from advsearch.trust.programs import find_blender as find_blender
 from advsearch.trust.programs import surroundings as surroundings
 

@@ -29,9 +29,10 @@ from advsearch import registry
 from advsearch.errors import InputError
 from advsearch.report import wording
 from advsearch.report.figures import BLUE, GREY, RED, Figures, drawn, figure_of, new_axes
-from advsearch.report.wording import percent
+from advsearch.report.wording import share_text as share_text
 from advsearch.runs.files import png_bytes
 from advsearch.runs.results import INTERRUPTED, RUNNING, AverageCase, Fields, Formation, Interval, Result, VerifiedRate
+from advsearch.runs.results import Extent as Extent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -212,18 +213,6 @@ def _words(name: str) -> str:
 Kind = Literal["found", "not found", "measured", "nothing claimed"]
 
 
-class Extent(Fields):
-    """A count with the interval of its share."""
-
-    what: str = Field(description="what was counted")
-    count: int
-    total: int = Field(alias="of")
-    interval: Interval = Field(description="95 %, of the share")
-    share: float | None = Field(
-        default=None, description="the mean over draws of the share of each, where some share one; absent elsewhere"
-    )
-
-
 class Claim(Fields):
     """One sentence that a run stands for, and no more than that."""
 
@@ -294,16 +283,7 @@ def extent_of(what: str, rate: VerifiedRate | None) -> Extent | None:
 
 
 def counted(what: str, count: int, total: int, interval: Interval | None, share: float | None = None) -> Extent:
-    """Return a count with the interval of its share, which is `share` where that is not count over total."""
-    own_share = share if total and share != count / total else None
-    return Extent(what=what, count=count, total=total, interval=interval or (0.0, 1.0), share=own_share)
-
-
-def share_text(extent: Extent) -> str:
-    share = "none"
-    if extent.total:
-        share = percent(extent.count / extent.total if extent.share is None else extent.share)
-    return f"{extent.count} of {extent.total} ({share}, 95 % interval {wording.interval_text(extent.interval)})"
+    return Extent.of(what, count, total, interval, share)
 
 
 def nothing_claimed(why: str, more: str = "") -> Claim:

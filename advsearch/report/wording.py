@@ -11,7 +11,7 @@ from advsearch.options import NOT_A_NUMBER, Outcome, get_outcome
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:
-    from advsearch.runs.results import ConditionRow, ControlGroup, Formation, Interval, SharedWork, VerifiedRate
+    from advsearch.runs.results import ConditionRow, ControlGroup, Extent, Formation, Interval, SharedWork, VerifiedRate
 
 
 CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
@@ -386,3 +386,11 @@ def number_text(value: Any) -> str:
 
 def conditions_text(conditions: Sequence[ConditionRow]) -> str:
     return " and ".join(one.text for one in conditions) or "everything that was looked at"
+
+
+def share_text(extent: Extent) -> str:
+    """Return ``12 of 20 (60 %, 95 % interval 36-81 %)``."""
+    share = "none"
+    if extent.total:
+        share = percent(extent.count / extent.total if extent.share is None else extent.share)
+    return f"{extent.count} of {extent.total} ({share}, 95 % interval {interval_text(extent.interval)})"

@@ -14,7 +14,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
-from advsearch.runs import files, store, summary
+from advsearch.runs import files, store
+from advsearch.runs import summary as summary
 from advsearch.runs.trackers import Tracker, check_tracker
 from advsearch.settings import HEADER, PythonOnly, settings
 from advsearch.trust.stored_files import open_regular
@@ -216,10 +217,14 @@ class RunDirectory:
     @staticmethod
     def find_file_changed_since(run: Path, config: Config) -> str | None:
         """Return the name of a file that settings name and that is another one than when a run was made, or None."""
+        return summary.changed_file(RunDirectory.read_made_with(run), config.plain())
+
+    @staticmethod
+    def read_made_with(run: Path) -> list[dict[str, object]]:
+        """Return versions and digests of files of each sitting in which a run was made, as it noted them."""
         with store.Store.open_to_read(run) as results:
             noted = results.noted(summary.MADE_WITH)
-        before = [one for one in noted if isinstance(one, dict)] if isinstance(noted, list) else []
-        return summary.changed_file(before, config.plain())
+        return [sitting for sitting in noted if isinstance(sitting, dict)] if isinstance(noted, list) else []
 
     @staticmethod
     def read_python_only(run: str | Path) -> list[PythonOnly]:

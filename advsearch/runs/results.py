@@ -227,6 +227,24 @@ class ConditionRow(Fields):
     text: str
 
 
+class Extent(Fields):
+    """A count with the interval of its share."""
+
+    what: str = Field(description="what was counted")
+    count: int
+    total: int = Field(alias="of")
+    interval: Interval = Field(description="95 %, of the share")
+    share: float | None = Field(
+        default=None, description="the mean over draws of the share of each, where some share one; absent elsewhere"
+    )
+
+    @classmethod
+    def of(cls, what: str, count: int, total: int, interval: Interval | None, share: float | None = None) -> Extent:
+        """Return a count with the interval of its share, which is `share` where that is not count over total."""
+        own_share = share if total and share != count / total else None
+        return cls(what=what, count=count, total=total, interval=interval or (0.0, 1.0), share=own_share)
+
+
 class StudyResult(RunResult):
     """What several attacks found; each is a run of its own in the folder `parts`."""
 
