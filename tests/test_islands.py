@@ -26,7 +26,7 @@ OTHER_ISLANDS = {
     "advsearch.questions.photographs": "photographs of runs",
     "advsearch.questions.report": "command report",
 }
-"""Islands that no table of parts has, with what they are: they are found by a name that `advsearch.registry` imports."""
+"""Islands that no table of parts has, with what they are: `advsearch.registry` imports them by a name."""
 
 ELSEWHERE = {"advsearch.cli.report": "advsearch.questions.report"}
 """Modules that belong to an island, but stand in the folder of their kind."""

@@ -150,10 +150,9 @@ def criterion_lines(
         named = ", ".join(chosen)
         counts = Counter(verdicts.values())
         lines.append(
-            f"At least {wording.percent(criterion)}, each condition by its own 95 % interval: "
-            f"met in {counts['met']}, "
-            f"not met in {counts['not met']} and open in {counts['open']} of {len(verdicts)}. There is no verdict over all: "
-            f"the values of {named} were chosen."
+            f"At least {wording.percent(criterion)}, each condition by its own 95 % interval: met in {counts['met']}, "
+            f"not met in {counts['not met']} and open in {counts['open']} of {len(verdicts)}. There is no verdict over "
+            f"all: the values of {named} were chosen."
         )
     for verdict in ("not met", "open") if chosen else ("not met",):
         if where := [condition for condition, told in verdicts.items() if told == verdict]:
