@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from advsearch.controls.support.picture_control import PictureControl as PictureControl
     from advsearch.engine import gradients as gradients
     from advsearch.engine.problem import Problem as Problem
+    from advsearch.errors import AdvsearchError as AdvsearchError
     from advsearch.errors import FileFormatError as FileFormatError
     from advsearch.errors import InputError as InputError
     from advsearch.errors import ModelError as ModelError
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from advsearch.progress import Progress as Progress
     from advsearch.questions.attack.settings import AttackConfig as AttackConfig
     from advsearch.questions.sweep.settings import SweepConfig as SweepConfig
+    from advsearch.registry import get_experiment as get_experiment
     from advsearch.report import figures as figures
     from advsearch.report import wording as wording
     from advsearch.report.shown import Claim as Claim
@@ -62,6 +64,7 @@ if TYPE_CHECKING:
     from advsearch.report.shown import Picture as Picture
     from advsearch.report.shown import ResultPart as ResultPart
     from advsearch.report.shown import ShownResult as ShownResult
+    from advsearch.runs import directory as directory
     from advsearch.runs import results as results
     from advsearch.runs.directory import RunDirectory as RunDirectory
     from advsearch.runs.directory import find_run as find_run
@@ -90,6 +93,7 @@ if TYPE_CHECKING:
     from advsearch.tasks import Task as Task
     from advsearch.trust import stored_files as stored_files
     from advsearch.trust import writing as writing
+    from advsearch.viewer import markup as markup
     from advsearch.viewer import thumbnails as thumbnails
 
 _NAMES = {
@@ -101,13 +105,14 @@ _NAMES = {
     "advsearch.controls.ranges": ("Fixed", "OneOf", "Range"),
     "advsearch.controls.support.picture_control": ("PictureControl",),
     "advsearch.engine.problem": ("Problem",),
-    "advsearch.errors": ("FileFormatError", "InputError", "ModelError", "UnknownNameError"),
+    "advsearch.errors": ("AdvsearchError", "FileFormatError", "InputError", "ModelError", "UnknownNameError"),
     "advsearch.experiment": ("PositionalArgument", "RunContext", "experiment", "fail_check"),
     "advsearch.models": ("Model",),
     "advsearch.options": ("Value",),
     "advsearch.progress": ("Progress",),
     "advsearch.questions.attack.settings": ("AttackConfig",),
     "advsearch.questions.sweep.settings": ("SweepConfig",),
+    "advsearch.registry": ("get_experiment",),
     "advsearch.report.shown": ("Claim", "Column", "InNotebook", "Picture", "ResultPart", "ShownResult"),
     "advsearch.runs.directory": ("RunDirectory", "find_run"),
     "advsearch.runs.exporters": ("Exported", "Exporter"),
@@ -123,11 +128,13 @@ _NAMES = {
 _MODULES = {
     "assets": "advsearch.scene.assets",
     "color": "advsearch.scene.color",
+    "directory": "advsearch.runs.directory",
     "figures": "advsearch.report.figures",
     "geometry": "advsearch.scene.geometry",
     "gradients": "advsearch.engine.gradients",
     "images": "advsearch.controls.support.images",
     "library": "advsearch.scene.library",
+    "markup": "advsearch.viewer.markup",
     "mitsuba_data": "advsearch.scene.mitsuba_backend.mitsuba_data",
     "models": "advsearch.models",
     "parts": "advsearch.scene.parts",

@@ -25,7 +25,9 @@ from advsearch.attacks import search as search
 from advsearch.attacks.verification import LEAST_RATE as LEAST_RATE
 from advsearch.attacks.verification import OVER_CONDITIONS as OVER_CONDITIONS
 from advsearch.attacks.verification import WORST_CASE as WORST_CASE
+from advsearch.calls import helped as helped
 from advsearch.cluster import InProcess as InProcess
+from advsearch.config import DEFAULT_ENVIRONMENT as DEFAULT_ENVIRONMENT
 from advsearch.controls import CONTROLS as CONTROLS
 from advsearch.engine.image_changes import AWAY as AWAY
 from advsearch.engine.image_changes import as_claimed as as_claimed
@@ -35,19 +37,24 @@ from advsearch.engine.journal import Shared as Shared
 from advsearch.engine.journal import check_made_of as check_made_of
 from advsearch.engine.journal import worker_call as worker_call
 from advsearch.engine.judging import domain_of as domain_of
+from advsearch.engine.judging import judgements as judgements
 from advsearch.engine.loading import Scene as Scene
 from advsearch.engine.loading import load_scene as load_scene
 from advsearch.engine.naming import check_run_settings as check_run_settings
+from advsearch.engine.naming import in_turn as in_turn
 from advsearch.engine.naming import load_models as load_models
 from advsearch.engine.naming import scene_settings as scene_settings
 from advsearch.engine.naming import settings_alone as settings_alone
 from advsearch.engine.record import control_group as control_group
+from advsearch.engine.record import judged as judged
 from advsearch.engine.record import verified_rate as verified_rate
 from advsearch.engine.verifier import RetrialCondition as RetrialCondition
 from advsearch.engine.verifier import Retrials as Retrials
 from advsearch.engine.verifier import Verifier as Verifier
 from advsearch.engine.verifier import kept_configuration as kept_configuration
 from advsearch.engine.verifier import ladder_of as ladder_of
+from advsearch.options import FROM_RUN as FROM_RUN
+from advsearch.options import Value as Value
 from advsearch.options import count_outcomes as count_outcomes
 from advsearch.pictures import upright as upright
 from advsearch.progress import NullProgress as NullProgress
@@ -59,6 +66,7 @@ from advsearch.questions.attack.carry_out import AttackParts as AttackParts
 from advsearch.questions.attack.carry_out import attack_on as attack_on
 from advsearch.questions.attack.carry_out import check_from_config as check_from_config
 from advsearch.questions.attack.carry_out import executor_for as executor_for
+from advsearch.questions.attack.carry_out import judged_alone as judged_alone
 from advsearch.questions.attack.carry_out import parts_in as parts_in
 from advsearch.questions.attack.carry_out import parts_of as parts_of
 from advsearch.questions.attack.carry_out import problem_from_config as problem_from_config
@@ -69,11 +77,13 @@ from advsearch.questions.attack.result import AttackResult as AttackResult
 from advsearch.questions.attack.summary import AttackSummary as AttackSummary
 from advsearch.questions.attack.summary import attack_of as attack_of
 from advsearch.questions.sweep.carry_out import row_parameters as row_parameters
+from advsearch.questions.sweep.carry_out import scenes_of as scenes_of
 from advsearch.questions.sweep.display import surface_sentences as surface_sentences
 from advsearch.questions.sweep.predicting import prepare_surface_light as prepare_surface_light
 from advsearch.questions.sweep.stored import StoredSweep as StoredSweep
 from advsearch.registry import get_experiment as get_experiment
 from advsearch.registry import imported
+from advsearch.runs.store import Row as Row
 from advsearch.runs.summary import read_configuration as read_configuration
 from advsearch.runs.tables import units_of as units_of
 from advsearch.scene.assembly import posed as posed
@@ -83,7 +93,10 @@ from advsearch.scene.importing.files import last_line as last_line
 from advsearch.scene.parts import PluginPart as PluginPart
 from advsearch.scene.parts import sphere as sphere
 from advsearch.scene.renderer import MAX_SPP as MAX_SPP
+from advsearch.tasks import AnyTask as AnyTask
 from advsearch.tasks import make_task as make_task
+from advsearch.tasks.base import Truth as Truth
+from advsearch.tasks.together import Together as Together
 from advsearch.threads import all_for_torch as all_for_torch
 from advsearch.threads import cores as cores
 from advsearch.trust.programs import find_blender as find_blender

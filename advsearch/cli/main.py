@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from advsearch import __version__
+from advsearch.catalog import is_present
 from advsearch.cli import output
 from advsearch.cli.output import BAD_INPUT, INTERRUPTED, OK, at_work, end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, CodeNotAllowedError, InputError, UnknownNameError
@@ -191,12 +192,17 @@ def list_commands() -> list[str]:
 def group_commands() -> dict[str, list[str]]:
     """Return the names of the commands by the heading that the help has for them, without those that are missing."""
     groups = {
-        title: [name for name, target in group.items() if target or name in EXPERIMENTS]
+        title: [name for name, target in group.items() if _is_available(name, target)]
         for title, group in GROUPS.items()
     }
     known = {name for group in groups.values() for name in group}
     next(iter(groups.values())).extend(name for name in EXPERIMENTS if name not in known)
     return groups
+
+
+def _is_available(name: str, target: str) -> bool:
+    """Return whether the module of a command is there; `target` as in `GROUPS`."""
+    return is_present(f"advsearch.cli.{target.partition(':')[0]}") if target else name in EXPERIMENTS
 
 
 def get_command(name: str) -> ExperimentCommand | PlainCommand:

@@ -12,7 +12,7 @@ from typing import Any
 
 from advsearch.cli import output
 from advsearch.cli.main import argument, command
-from advsearch.errors import InputError
+from advsearch.extend import InputError
 
 NAME = "evidence"
 POSES, LARGEST_POSES = "poses.csv", 1 << 20  # the file that says where photographs were taken, and its most bytes
@@ -46,10 +46,9 @@ POSES, LARGEST_POSES = "poses.csv", 1 << 20  # the file that says where photogra
 )
 def report(args: argparse.Namespace) -> int:
     # late, so that --help answers at once
+    from advsearch.extend import directory, writing
     from advsearch.questions.report.evidence import collected, read_exposure
     from advsearch.questions.report.result import evidence_page, markdown
-    from advsearch.runs.summary import to_json
-    from advsearch.trust.writing import write_bytes, write_text
 
     if not args.evidence:
         raise InputError(
@@ -72,10 +71,10 @@ def report(args: argparse.Namespace) -> int:
     except OSError as error:
         raise InputError(f"--out: cannot make the folder {folder}: {error.strerror}") from None
     for name, data in pictures.items():
-        write_bytes(folder / name, data)
-    texts = (evidence_page(evidence, pictures), markdown(evidence), to_json(evidence) + "\n")
+        writing.write_bytes(folder / name, data)
+    texts = (evidence_page(evidence, pictures), markdown(evidence), directory.summary.to_json(evidence) + "\n")
     for path, text in zip(names, texts, strict=True):
-        write_text(path, text)
+        writing.write_text(path, text)
     lines = [text for run in evidence.runs for text in (run.run, *(f"  {c.kind}: {c.statement}" for c in run.claims))]
     notes = "".join(f"\nNote: {text}" for text in evidence.warnings)
     return output.say(args.json, evidence.to_dict(), "\n".join([*lines, notes, *map(str, names)]))
@@ -83,12 +82,10 @@ def report(args: argparse.Namespace) -> int:
 
 def _take_in(folder: str, name: str) -> None:
     """Have a run's model judge the photographs in a folder that the run does not have yet."""
-    from advsearch.extend import workbench  # it brings torch
-    from advsearch.runs.directory import CONFIG, find_run
-    from advsearch.settings import read_yaml
+    from advsearch.extend import directory, find_run, settings, workbench  # the last brings torch
 
     run = find_run(name)
-    task: Any = read_yaml(run / CONFIG).get("task") or "classification"
+    task: Any = settings.read_yaml(run / directory.CONFIG).get("task") or "classification"
     with tempfile.TemporaryDirectory() as named:
         place = Path(folder)
         if (place / POSES).is_file():
@@ -108,13 +105,13 @@ def _take_in(folder: str, name: str) -> None:
 def _named_by_pose(folder: Path, run: Path, out: Path) -> Path:
     """Copy the photographs that `POSES` lists, each under the name of the rendering that has its pose."""
     # late, so that --help answers at once
-    from advsearch.runs.store import NAME as STORE
-    from advsearch.runs.store import Store
-    from advsearch.trust.stored_files import read_text
+    from advsearch.extend import Store, stored_files
 
-    with Store(run / STORE, read_only=True) as store:
+    with Store.open_to_read(run) as store:
         rows = [(row.step, {name: value["value"] for name, value in row.values.items()}) for row in store.rows("sweep")]
-    for line, pose in enumerate(csv.DictReader(read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()), 2):
+    for line, pose in enumerate(
+        csv.DictReader(stored_files.read_text(folder / POSES, "poses", LARGEST_POSES).splitlines()), 2
+    ):
         where, file = f"photographs: {folder / POSES}, line {line}", folder / Path(str(pose.pop("file", ""))).name
         if not file.is_file():
             raise InputError(f"{where}: expected the name of a photograph beside it under `file`, got {file.name!r}")

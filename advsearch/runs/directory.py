@@ -14,7 +14,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
-from advsearch.runs import files, store, summary
+from advsearch.runs import files, store
+from advsearch.runs import summary as summary
 from advsearch.runs.trackers import Tracker, check_tracker
 from advsearch.settings import CONFIG as CONFIG
 from advsearch.settings import HEADER, PythonOnly, settings, shown
@@ -233,9 +234,14 @@ class RunDirectory:
     @staticmethod
     def find_file_changed_since(run: Path, config: Config) -> str | None:
         """Return the name of a file that settings name and that is another one than when a run was made, or None."""
+        return summary.changed_file(RunDirectory.read_made_with(run), config.plain())
+
+    @staticmethod
+    def read_made_with(run: Path) -> dict[str, object]:
+        """Return the versions and the digests of files and weights that a run was made with, as it noted them."""
         with store.Store.open_to_read(run) as results:
             noted = results.noted(summary.MADE_WITH)
-        return summary.changed_file(noted if isinstance(noted, dict) else {}, config.plain())
+        return noted if isinstance(noted, dict) else {}
 
     @staticmethod
     def read_python_only(run: str | Path) -> list[PythonOnly]:

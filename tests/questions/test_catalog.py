@@ -84,6 +84,19 @@ def test_without_all_removable_experiments_the_tool_works(tmp_path: Path) -> Non
     assert (tmp_path / "runs" / "kept" / "report.html").is_file()
 
 
+def test_without_reports_and_photographs_the_tool_works(tmp_path: Path) -> None:
+    copy_package(tmp_path, ("report", "photographs"))
+    (tmp_path / "advsearch" / "cli" / "report.py").unlink()
+    shown_help = run_python(tmp_path, "-m", "advsearch", "--help")
+    assert shown_help.returncode == 0, shown_help.stderr
+    assert "\n  dashboard " in shown_help.stdout and "\n  report " not in shown_help.stdout
+    unknown = run_python(tmp_path, "-m", "advsearch", "report", "mug-sweep-001")
+    assert unknown.returncode == 2 and "unknown command 'report'" in unknown.stderr
+    code = "import advsearch.api.workbench, advsearch.cli.dashboard, advsearch.cli.show, advsearch.viewer.server"
+    imported = run_python(tmp_path, "-c", code)
+    assert imported.returncode == 0, imported.stderr
+
+
 IMPORT_WITHOUT_EACH = """
 import os, pkgutil, sys
 from importlib import import_module

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,40 +17,36 @@ import torch
 from PIL import Image
 from pydantic import JsonValue
 
-from advsearch import seeds
-from advsearch.calls import helped
-from advsearch.engine.judging import judgements
-from advsearch.engine.naming import in_turn
-from advsearch.engine.record import judged
-from advsearch.engine.verifier import kept_configuration
-from advsearch.errors import FileFormatError, InputError
-from advsearch.files import JsonObject
-from advsearch.models import Model
-from advsearch.options import Value
-from advsearch.questions.attack.carry_out import judged_alone, problem_from_config
-from advsearch.questions.attack.settings import AttackConfig
+from advsearch.extend import (
+    AttackConfig,
+    FileFormatError,
+    InputError,
+    Judgement,
+    Model,
+    RunDirectory,
+    Store,
+    SweepConfig,
+    Task,
+    directory,
+    find_run,
+    markup,
+    seeds,
+    settings,
+    statistics,
+    stored_files,
+    workbench,
+    writing,
+)
 from advsearch.questions.photographs import result
 from advsearch.questions.photographs.result import LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
-from advsearch.questions.sweep.carry_out import scenes_of
-from advsearch.questions.sweep.settings import SweepConfig
-from advsearch.runs.directory import CONFIG, PHOTOGRAPHS, RunDirectory, find_run
-from advsearch.runs.store import NAME, Row, Store
-from advsearch.settings import read_yaml
-from advsearch.statistics.intervals import clopper_pearson
-from advsearch.tasks import AnyTask, Judgement, Task, make_task
-from advsearch.tasks.base import Truth
-from advsearch.tasks.together import Together
-from advsearch.trust.stored_files import read_bytes
-from advsearch.trust.writing import write_bytes
-from advsearch.viewer.clients import LARGEST_SENT
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")  # of the files in a folder that are photographs
 _ALIGNED = re.compile(r"rendering-([0-9]{1,12})(?:-.*)?")
 """The name of a file with a photograph that was aligned with a rendering."""
 
 
-@helped
-@in_turn()
+@workbench.helped
+@workbench.in_turn()
 def photo_agreement(run: str | Path) -> PhotoAgreement:
     """Return how the photographs that were taken for a run agree with its renderings (docs/viewer.md).
 
@@ -61,7 +58,7 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
         FileFormatError: what was kept of a photograph is something else.
     """
     kept, rows = ["rendering", "right", "label", "file"], list[dict[str, object]]()
-    with Store(find_run(run) / NAME, read_only=True) as store:
+    with Store.open_to_read(find_run(run)) as store:
         for row in store.rows(PHOTO):
             if not {*kept} <= (photo := _photo_of(row)).keys():
                 raise FileFormatError(f"row {row.id}: expected what was kept of a photograph, got something else")
@@ -80,28 +77,28 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
             PhotographedRendering(
                 rendering=str(name), model=str(model), label=str(last["label"]), rendering_right=bool(last["right"]),
                 photos=photos, photos_right=int(group["correct"].sum()), agreeing=alike,
-                interval=clopper_pearson(alike, photos), labels=list(group["said"]),
+                interval=statistics.intervals.clopper_pearson(alike, photos), labels=list(group["said"]),
                 files=list(map(str, group["file"])),
             )
         )  # fmt: skip
-    interval = clopper_pearson(agreeing, len(table)) if rows else None
+    interval = statistics.intervals.clopper_pearson(agreeing, len(table)) if rows else None
     agreement = agreeing / len(table) if rows else None
     return PhotoAgreement(photos=len(table), agreement=agreement, interval=interval, renderings=renderings, **counts)
 
 
-def _photo_of(row: Row) -> JsonObject:
+def _photo_of(row: workbench.Row) -> dict[str, Any]:
     """What was kept of a photograph: its file, `source` of one that was no browser's, and what its rendering says."""
     photo = row.payload.get("photo") if isinstance(row.payload, dict) else None
     return photo if isinstance(photo, dict) else {}
 
 
-def photographs_in(folder: Path, task: AnyTask) -> list[Path]:
+def photographs_in(folder: Path, task: workbench.AnyTask) -> list[Path]:
     """Return the files in a folder that are photographs by their names; none where there is no such folder. An
     InputError where the task asks where the object is, and one of them was aligned with no rendering."""
     files = sorted(folder.iterdir()) if folder.is_dir() else []
     photographs = [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
     loose = [file for file in photographs if not _ALIGNED.fullmatch(file.stem)]
-    if loose and (made := make_task(task)) and (made.varies or made.calibrates):
+    if loose and (made := workbench.make_task(task)) and (made.varies or made.calibrates):
         raise InputError(
             f"{loose[0].name}: the task asks where the object is, and only a rendering says that; name the file "
             "rendering-NUMBER.jpg by the rendering that it was aligned with, or take it out"
@@ -133,10 +130,13 @@ class Photographs:
         """Judge the photographs in some files that the run, a sweep of one object, does not have yet, by their names.
         A file ``rendering-12.jpg``, or ``rendering-12-`` and anything, was aligned with the rendering 12. All others
         show the object as it stood by chance: they are judged, but are compared with no single rendering."""
-        with Store(run / NAME, read_only=True) as store:
+        with Store.open_to_read(run) as store:
             known = {_photo_of(row).get("source") for kind in (PHOTO, LOOSE_PHOTO) for row in store.rows(kind)}
         for file in (file for file in files if file.name not in known):
-            aligned, data = _ALIGNED.fullmatch(file.stem), read_bytes(file, "a photograph", LARGEST_SENT)
+            aligned, data = (
+                _ALIGNED.fullmatch(file.stem),
+                stored_files.read_bytes(file, "a photograph", markup.LARGEST_SENT),
+            )
             try:
                 self._thread.submit(self._add, run, aligned and aligned[1], data, file.name).result()
             except InputError as error:
@@ -146,7 +146,7 @@ class Photographs:
         return photo_agreement(run)
 
     @staticmethod
-    def list_files(folder: Path, task: AnyTask) -> list[Path]:
+    def list_files(folder: Path, task: workbench.AnyTask) -> list[Path]:
         """Return the files in a folder that are photographs; errors as for `photographs_in`."""
         return photographs_in(folder, task)
 
@@ -160,7 +160,7 @@ class Photographs:
         with RunDirectory.resume(run) as held:
             number, rows, judges = held.store.last_step(kind) + 1, [], self._judges(run)
             for place, judge in enumerate(judges):
-                values: dict[str, Value] = {}
+                values: dict[str, workbench.Value] = {}
                 if file is None or rendering is None:
                     sound = result.sound_photo(data, judge.size[::-1])
                 else:
@@ -179,10 +179,12 @@ class Photographs:
                     kept["file"] = f"{rendering}-{number:04d}.jpg"
                 shown = str(values["object"]["value"]) if "object" in values else None  # of a sweep over several
                 values["model"] = {"value": judge.model.name, "unit": ""}
-                row = judged(Row(kind, number, values=values), judge.judgement(rendering, shown, sound))
+                row = workbench.judged(
+                    workbench.Row(kind, number, values=values), judge.judgement(rendering, shown, sound)
+                )
                 rows.append(replace(row, payload={"photo": {**kept}, "answer": row.payload}))
             if file is not None:
-                write_bytes(run / PHOTOGRAPHS / str(kept["file"]), sound)
+                writing.write_bytes(run / directory.PHOTOGRAPHS / str(kept["file"]), sound)
             held.record(*rows)
 
 
@@ -194,7 +196,7 @@ class _PhotoJudge:
     model: Model
     task: Task
     size: tuple[int, int]
-    truth: Callable[[str | None, str | None], Truth]
+    truth: Callable[[str | None, str | None], workbench.Truth]
 
     def judgement(self, rendering: str | None, name: str | None, data: bytes) -> Judgement:
         """What is to be said of a picture, made as large as the run's renderings are: in 8 bits, with Lanczos' filter,
@@ -203,24 +205,24 @@ class _PhotoJudge:
             small = image.convert("RGB").resize(self.size[::-1], Image.Resampling.LANCZOS)
         pixels = torch.from_numpy(np.asarray(small, dtype=np.float32) / np.float32(255.0))
         with torch.no_grad():
-            return judgements(self.task, self.model(pixels), pixels[None], [self.truth(rendering, name)])[0]
+            return workbench.judgements(self.task, self.model(pixels), pixels[None], [self.truth(rendering, name)])[0]
 
 
 def _judges_of(run: Path) -> list[_PhotoJudge]:
     """Who judges photographs of a run; where an object is seen is judged by the rendering that it was aligned with."""
-    command = read_yaml(run / CONFIG).get("command")
+    command = settings.read_yaml(run / directory.CONFIG).get("command")
     if command == "sweep":
-        return _by_sweep(SweepConfig.from_yaml(run / CONFIG))
+        return _by_sweep(SweepConfig.from_yaml(run / directory.CONFIG))
     if command == "attack":
-        return _by_attack(run, AttackConfig.from_yaml(run / CONFIG))
+        return _by_attack(run, AttackConfig.from_yaml(run / directory.CONFIG))
     raise InputError(f"{run.name}: photographs belong to renderings of attacks and sweeps, not of {command}")
 
 
 def _by_sweep(config: SweepConfig) -> list[_PhotoJudge]:
-    scenes = scenes_of(config)
+    scenes = workbench.scenes_of(config)
     job = scenes.job
 
-    def truth(model: int, rendering: str | None, name: str | None) -> Truth:
+    def truth(model: int, rendering: str | None, name: str | None) -> workbench.Truth:
         task = job.tasks[model]
         if rendering is None or not (task.varies or task.calibrates):
             place = next((place for place in job.places if place.object == name), job.places[0])
@@ -236,19 +238,19 @@ def _by_sweep(config: SweepConfig) -> list[_PhotoJudge]:
 
 
 def _by_attack(run: Path, config: AttackConfig) -> list[_PhotoJudge]:
-    problem, _ = problem_from_config(judged_alone(config))
+    problem, _ = workbench.problem_from_config(workbench.judged_alone(config))
 
-    def truth(task: Task, rendering: str | None, _: str | None) -> Truth:
+    def truth(task: Task, rendering: str | None, _: str | None) -> workbench.Truth:
         """Of the clean configuration, of the adversarial one, or of one of its trials."""
         known = rendering in (None, "clean") or not (task.varies or task.calibrates)
-        u = problem.domain.start if known else kept_configuration(run, problem)
+        u = problem.domain.start if known else workbench.kept_configuration(run, problem)
         trial = (rendering or "").rpartition("verification-")[2]
         whole = problem.whole(u, seeds.stream(problem.seed, "verification", int(trial)) if trial.isdigit() else None)
         look = partial(problem.renderer.surfaces, whole)
         return task.truth(problem.facts(partial(problem.space.describe, whole), look))
 
     alone: list[tuple[Model, Task]] = [(problem.model, problem.task)]
-    if isinstance(problem.task, Together):
+    if isinstance(problem.task, workbench.Together):
         alone = list(zip(problem.task.models, problem.task.tasks, strict=True))
     size = config.resolution
     return [_PhotoJudge(model, task, size or model.input_size, partial(truth, task)) for model, task in alone]

@@ -12,7 +12,7 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
-from advsearch.errors import InputError
+from advsearch.extend import InputError, markup
 from advsearch.questions.photographs.result import (
     align_page,
     photo_file,
@@ -20,7 +20,6 @@ from advsearch.questions.photographs.result import (
     rendering_names,
     table_html,
 )
-from advsearch.trust.pages import Refused
 
 KEY = "X-Advsearch-Key"  # the header with which this server's page sends a photograph; another page could not send it
 
@@ -64,7 +63,9 @@ class PhotographPages:
         """
         sent = headers.get(KEY, "").encode("utf-8", "replace")
         if headers.get("Origin") is None or not hmac.compare_digest(key.encode(), sent):
-            raise Refused(HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew")
+            raise markup.Refused(
+                HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew"
+            )
         with refused(HTTPStatus.NOT_FOUND):
             rendering_file(run, name)
         with refused(HTTPStatus.BAD_REQUEST):
@@ -78,4 +79,4 @@ def refused(status: HTTPStatus) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise Refused(status, str(error)) from None
+        raise markup.Refused(status, str(error)) from None

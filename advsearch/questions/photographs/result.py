@@ -17,15 +17,7 @@ from pathlib import Path
 from PIL import Image, ImageOps
 from pydantic import Field
 
-from advsearch.errors import InputError
-from advsearch.report import wording
-from advsearch.report.shown import Html, element, join_html
-from advsearch.report.wording import percent
-from advsearch.runs.directory import IMAGES, PHOTOGRAPHS
-from advsearch.runs.results import Fields, Interval
-from advsearch.viewer.clients import LARGEST_SENT, NO_QR, qr_code
-from advsearch.viewer.document import data_script, document, in_address, study_table
-from advsearch.viewer.thumbnails import kept_file, kept_pictures
+from advsearch.extend import Fields, InputError, Interval, directory, markup, wording
 
 PHOTO, LOOSE_PHOTO = "photo", "loose photo"
 """Kinds of rows in a run's store: photographs that were aligned with a rendering, and ones that were with none."""
@@ -71,7 +63,7 @@ def rendering_file(run: Path, name: str) -> Path:
     """Return the file of a rendering; an InputError where the run has none of that name."""
     file = None
     if _NAME.fullmatch(name):
-        file = kept_file(run, int(name)) if name.isdigit() else run / IMAGES / f"{name}.png"
+        file = markup.kept_file(run, int(name)) if name.isdigit() else run / directory.IMAGES / f"{name}.png"
     if file is None or not file.is_file():
         raise InputError(f"rendering: {run.name} has none called {name[:40]!r}; open its page for those that it has")
     return file
@@ -79,15 +71,15 @@ def rendering_file(run: Path, name: str) -> Path:
 
 def rendering_names(run: Path) -> tuple[str, ...]:
     """Return the names of a run's renderings; empty where it kept none."""
-    if (kept := kept_pictures(run)) is not None:
+    if (kept := markup.kept_pictures(run)) is not None:
         return tuple(map(str, kept.numbers))
-    names = [file.stem for file in (run / IMAGES).glob("*.png") if _NAME.fullmatch(file.stem)]
+    names = [file.stem for file in (run / directory.IMAGES).glob("*.png") if _NAME.fullmatch(file.stem)]
     return tuple(sorted(names, key=lambda name: (name != "adversarial", name)))
 
 
 def photo_file(run: Path, name: str) -> Path:
     """Return the file of a photograph that was kept; an InputError where there is none of that name."""
-    file = run / PHOTOGRAPHS / name
+    file = run / directory.PHOTOGRAPHS / name
     if not _PHOTO.fullmatch(name) or not file.is_file():
         raise InputError("photo: there is none of that name")
     return file
@@ -96,8 +88,8 @@ def photo_file(run: Path, name: str) -> Path:
 def sound_photo(data: bytes, shape: tuple[int, int]) -> bytes:
     """Return a photograph, sent as JPEG, PNG or WebP, as a JPEG of at most `SIDE` pixels a side, its middle cut to the
     ratio of a shape (width, height). An InputError where it is too large, or no such picture."""
-    if len(data) > LARGEST_SENT:
-        raise InputError(f"photo: expected at most {LARGEST_SENT >> 20} MB, got more; send a smaller one")
+    if len(data) > markup.LARGEST_SENT:
+        raise InputError(f"photo: expected at most {markup.LARGEST_SENT >> 20} MB, got more; send a smaller one")
     try:
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:
             if image.width * image.height > MOST_PIXELS:
@@ -123,61 +115,65 @@ def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: 
     with a photograph, and `elsewhere` the address by which another device opens the page, if one can."""
     named = ", ".join(renderings[:8]) + (f", ... {renderings[-1]}" if len(renderings) > 8 else "")
     how = "Lay a rendering over what the camera sees, move the real object until both agree, and take a photograph."
-    align = join_html(
-        element("p", how),
-        element("p", f"Renderings of this run ({len(renderings)}): {named}.", class_="soft", id="renderings"),
-        element("noscript", element("p", "The camera needs JavaScript, which is switched off.")),
+    align = markup.join_html(
+        markup.element("p", how),
+        markup.element("p", f"Renderings of this run ({len(renderings)}): {named}.", class_="soft", id="renderings"),
+        markup.element("noscript", markup.element("p", "The camera needs JavaScript, which is switched off.")),
     )
     none = "This run kept no pictures to align with. An attack keeps them when it ends; a sweep with "
-    without, code = element("p", none, element("code", "keep_pictures=all"), "."), None
+    without, code = markup.element("p", none, markup.element("code", "keep_pictures=all"), "."), None
     if elsewhere is not None:
-        made = qr_code(elsewhere)
-        svg = made and Html(made.svg_inline(omitsize=True, light="#fff", title="QR code of the address below"))
-        shown = svg or element("p", f"A code to point the phone at would stand here: {NO_QR}")
-        summary = element("summary", "Open this page on a phone")
-        address = element("pre", elsewhere, class_="wrap", tabindex="0")
-        code = element("details", summary, element("div", shown, class_="qr"), address)
-    main = element(
+        made = markup.qr_code(elsewhere)
+        svg = made and markup.Html(made.svg_inline(omitsize=True, light="#fff", title="QR code of the address below"))
+        shown = svg or markup.element("p", f"A code to point the phone at would stand here: {markup.NO_QR}")
+        summary = markup.element("summary", "Open this page on a phone")
+        address = markup.element("pre", elsewhere, class_="wrap", tabindex="0")
+        code = markup.element("details", summary, markup.element("div", shown, class_="qr"), address)
+    main = markup.element(
         "main",
-        element("div", align, id="align") if renderings else without,
-        element("h2", "Renderings and reality"),
-        element("div", table_html(table), id="agreement"),
+        markup.element("div", align, id="align") if renderings else without,
+        markup.element("h2", "Renderings and reality"),
+        markup.element("div", table_html(table), id="agreement"),
         code,
     )
-    header = element("header", element("p", "Photographs", class_="eyebrow"), element("h1", f"{run}, photographed"))
-    data = [data_script({"key": key, "names": list(renderings[:1])}, "photographing")] if renderings else []
+    header = markup.element(
+        "header", markup.element("p", "Photographs", class_="eyebrow"), markup.element("h1", f"{run}, photographed")
+    )
+    data = [markup.data_script({"key": key, "names": list(renderings[:1])}, "photographing")] if renderings else []
     scripts = ("make.js", "align.js") if renderings else ()
-    return document(f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True)
+    return markup.document(f"{run}, photographs", header, main, data=data, scripts=scripts, connects=True)
 
 
-def table_html(table: PhotoAgreement) -> Html:
+def table_html(table: PhotoAgreement) -> markup.Html:
     """Return the counts of right and wrong predictions in rendering and photograph, in all and by rendering."""
     if not table.photos or table.interval is None:
-        return element("p", "No photographs yet.", class_="soft")
+        return markup.element("p", "No photographs yet.", class_="soft")
     counts = [
         ["right in the rendering", str(table.right_right), str(table.right_wrong)],
         ["wrong in the rendering", str(table.wrong_right), str(table.wrong_wrong)],
     ]
     agreeing = table.right_right + table.wrong_wrong
     text = (
-        f"They agree in {agreeing} of {wording.count(table.photos, 'photograph')}: {percent(table.agreement)}, 95 % "
-        f"interval {wording.interval_text(table.interval)}."
+        f"They agree in {agreeing} of {wording.count(table.photos, 'photograph')}: "
+        f"{wording.percent(table.agreement)}, 95 % interval {wording.interval_text(table.interval)}."
     )
     several, rows = len({row.model for row in table.renderings}) > 1, []
     for row in table.renderings:
         photos = [
-            join_html(element("a", label or "nothing", href=f"photos/{in_address(file)}"), " ")
+            markup.join_html(markup.element("a", label or "nothing", href=f"photos/{markup.in_address(file)}"), " ")
             for label, file in zip(row.labels, row.files, strict=True)
         ]
         rendered = f"{'right' if row.rendering_right else 'wrong'}: {row.label}"
-        photographed = join_html(f"{row.photos_right} of {row.photos} right: ", *photos)
+        photographed = markup.join_html(f"{row.photos_right} of {row.photos} right: ", *photos)
         agree = f"{row.agreeing} of {row.photos}", wording.interval_text(row.interval)
         rows.append([row.rendering, *([row.model] if several else []), rendered, photographed, *agree])
     heads = ["rendering", *(["model"] if several else []), "in the rendering", "in photographs", "agree", "interval"]
-    each = study_table(heads, rows, [f"renderings/{in_address(row.rendering)}" for row in table.renderings])
+    each = markup.study_table(
+        heads, rows, [f"renderings/{markup.in_address(row.rendering)}" for row in table.renderings]
+    )
     counted = ("photographs", "right in the photograph", "wrong in the photograph")
-    return join_html(
-        element("div", study_table(counted, counts), class_="agreement"),
-        element("p", text),
-        element("div", each, class_="scroll", tabindex="0", role="region", aria_label="by rendering"),
+    return markup.join_html(
+        markup.element("div", markup.study_table(counted, counts), class_="agreement"),
+        markup.element("p", text),
+        markup.element("div", each, class_="scroll", tabindex="0", role="region", aria_label="by rendering"),
     )

@@ -13,10 +13,24 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from advsearch import __version__
-from advsearch.config import DEFAULT_ENVIRONMENT
-from advsearch.errors import AdvsearchError, InputError, UnknownNameError
-from advsearch.questions.attack.summary import AttackSummary
+from advsearch.extend import (
+    AdvsearchError,
+    Claim,
+    InputError,
+    Interval,
+    Store,
+    UnknownNameError,
+    __version__,
+    directory,
+    find_run,
+    get_experiment,
+    read_result,
+    results,
+    settings,
+    statistics,
+    stored_files,
+    wording,
+)
 from advsearch.questions.report.recorded import (
     CLAIM,
     RecordedSettings,
@@ -29,20 +43,6 @@ from advsearch.questions.report.recorded import (
     sweeps_read,
 )
 from advsearch.questions.report.result import ConditionShare, Evidence, EvidenceRun
-from advsearch.questions.sweep.summary import SweepSummary
-from advsearch.registry import get_experiment
-from advsearch.report import wording
-from advsearch.report.shown import Claim, claim, counted, nothing_claimed, share_text, shown
-from advsearch.report.wording import interval_text, number_text, percent
-from advsearch.runs.directory import CONFIG, IMAGES, PARTS, PHOTOGRAPHS, find_run, is_run, typed_name
-from advsearch.runs.results import RUNNING, AxisValue, Interval, Result, VariedValue
-from advsearch.runs.store import Row, Store
-from advsearch.runs.summary import NAME as SUMMARY
-from advsearch.runs.summary import read_result
-from advsearch.scene.description import NO_MAP
-from advsearch.settings import read_yaml
-from advsearch.statistics.intervals import clopper_pearson
-from advsearch.trust.stored_files import read_bytes
 
 # ---------------------------------------------------------------------------------------------------------------------
 # What an engineer reads of a run beside its claims: shares by condition, whether a criterion is met, how common
@@ -63,11 +63,24 @@ OTHER = "other"  # the part of what belongs to none of them
 Exposure = Mapping[str, Mapping[str, float]]  # how common the values of axes are: weights by axis and value
 
 
-def conditions_of(result: Result, photographs: Sequence[Row] | None = None) -> list[ConditionShare]:
+def is_attack(result: Any) -> bool:
+    """Whether a result is that of one attack, and not of a study of several."""
+    return isinstance(result, get_experiment("attack").result)
+
+
+def is_sweep(result: Any) -> bool:
+    return isinstance(result, get_experiment("sweep").result)
+
+
+def nothing_claimed(why: str) -> Claim:
+    return Claim(kind="nothing claimed", statement=f"Nothing is claimed: {why}.", extent=None)
+
+
+def conditions_of(result: results.Result, photographs: Sequence[Any] | None = None) -> list[ConditionShare]:
     """Return the share of right predictions by each value of each axis of a sweep; or that of its photographs which
     agree with the rendering that they were aligned with: right in both or wrong in both."""
     conditions = []
-    for row in result.axes if isinstance(result, SweepSummary) else ():
+    for row in result.axes if is_sweep(result) else ():
         right, total = row.correct, row.configurations
         interval: tuple[float, float] | None = row.interval or (0.0, 1.0)  # none of one draw
         if photographs is not None:
@@ -77,9 +90,9 @@ def conditions_of(result: Result, photographs: Sequence[Row] | None = None) -> l
                 if row.axis in photo.values and _has(photo.values[row.axis]["value"], row.value)
             ]
             right, total = sum(agree), len(agree)
-            interval = clopper_pearson(right, total) if total else None
+            interval = statistics.intervals.clopper_pearson(right, total) if total else None
         if total and interval is not None:
-            value = " to ".join(map(number_text, row.value if isinstance(row.value, tuple) else (row.value,)))
+            value = " to ".join(map(wording.number_text, row.value if isinstance(row.value, tuple) else (row.value,)))
             unit = "" if row.unit == "1" else row.unit
             conditions.append(
                 ConditionShare(
@@ -90,13 +103,13 @@ def conditions_of(result: Result, photographs: Sequence[Row] | None = None) -> l
     return conditions
 
 
-def _has(value: float | str, of: AxisValue) -> bool:
+def _has(value: float | str, of: Any) -> bool:
     if isinstance(value, str) or isinstance(of, str):
         return value == of
     return of[0] <= value <= of[1] if isinstance(of, tuple) else math.isclose(value, of)
 
 
-def triggering_conditions(result: Result) -> list[str]:
+def triggering_conditions(result: results.Result) -> list[str]:
     triggering = get_experiment(result.command).triggering
     return [] if triggering is None else list(triggering(result))
 
@@ -106,10 +119,10 @@ def met(criterion: float, interval: Interval) -> str:
     return "met" if interval[0] >= criterion else "not met" if interval[1] < criterion else "open"
 
 
-def chosen_axes(result: Result) -> list[str]:
+def chosen_axes(result: results.Result) -> list[str]:
     """Return the axes of a sweep whose several values somebody chose: they are not drawn, so that a share over them is
     one of these values."""
-    if not isinstance(result, SweepSummary):
+    if not is_sweep(result):
         return []
     counts = Counter(row.axis for row in result.axes if row.axis not in result.drawn)
     return [axis for axis, count in counts.items() if count > 1 and axis not in ("model", "answer")]
@@ -127,8 +140,8 @@ def criterion_lines(
     if not (chosen and conditions):
         over = f" Over the values of {', '.join(chosen)} that were chosen: others give another share." if chosen else ""
         lines = [
-            f"At least {percent(criterion)}: {met(criterion, extent.interval)} by {extent.count} of {extent.total} "
-            f"{extent.what}, 95 % interval {interval_text(extent.interval)}.{over}"
+            f"At least {wording.percent(criterion)}: {met(criterion, extent.interval)} by {extent.count} of "
+            f"{extent.total} {extent.what}, 95 % interval {wording.interval_text(extent.interval)}.{over}"
             for extent in (claim.extent for claim in claims if claim.extent is not None)
             if "right" in extent.what or "held-out" in extent.what
         ]
@@ -137,9 +150,9 @@ def criterion_lines(
         named = ", ".join(chosen)
         counts = Counter(verdicts.values())
         lines.append(
-            f"At least {percent(criterion)}, each condition by its own 95 % interval: met in {counts['met']}, not met "
-            f"in {counts['not met']} and open in {counts['open']} of {len(verdicts)}. There is no verdict over all: "
-            f"the values of {named} were chosen."
+            f"At least {wording.percent(criterion)}, each condition by its own 95 % interval: met in {counts['met']}, "
+            f"not met in {counts['not met']} and open in {counts['open']} of {len(verdicts)}. There is no verdict over "
+            f"all: the values of {named} were chosen."
         )
     for verdict in ("not met", "open") if chosen else ("not met",):
         if where := [condition for condition, told in verdicts.items() if told == verdict]:
@@ -151,7 +164,7 @@ def read_exposure(path: str) -> dict[str, dict[str, float]]:
     """Return what a YAML file says of how common values are, such as ``environment: {street: 0.8, street-wet: 0.2}``;
     an InputError where it is missing, or says something else."""
     exposure: dict[str, dict[str, float]] = {}
-    for axis, weights in read_yaml(path).items():
+    for axis, weights in settings.read_yaml(path).items():
         if not isinstance(weights, Mapping) or not weights:
             raise InputError(f"exposure: {path}: {axis}: expected values with a weight each, such as {{street: 0.8}}")
         for value, weight in weights.items():
@@ -163,11 +176,11 @@ def read_exposure(path: str) -> dict[str, dict[str, float]]:
     return exposure
 
 
-def exposure_lines(result: Result, conditions: Sequence[ConditionShare], exposure: Exposure) -> list[str]:
+def exposure_lines(result: results.Result, conditions: Sequence[ConditionShare], exposure: Exposure) -> list[str]:
     """Return the share of right predictions where the values of an axis are as common as weights say: the weighted mean
     of the shares, between those of the ends of intervals that hold together (Bonferroni)."""
     lines = []
-    independent = isinstance(result, SweepSummary) and result.units is None
+    independent = is_sweep(result) and result.units is None
     for axis, weights in exposure.items():
         rows = {row.value: row for row in conditions if row.axis == axis}
         if not rows:
@@ -183,11 +196,12 @@ def exposure_lines(result: Result, conditions: Sequence[ConditionShare], exposur
         mean = low = high = 0.0
         for value, weight in weights.items():
             row, part = rows[value], weight / total
-            ends = clopper_pearson(row.right, row.total, sure)
+            ends = statistics.intervals.clopper_pearson(row.right, row.total, sure)
             mean, low, high = mean + part * row.right / row.total, low + part * ends[0], high + part * ends[1]
-        shares = ", ".join(f"{value} {percent(weight / total)}" for value, weight in weights.items())
+        shares = ", ".join(f"{value} {wording.percent(weight / total)}" for value, weight in weights.items())
         lines.append(
-            f"Weighted by {axis} ({shares}): right in {percent(mean)}, 95 % interval {interval_text((low, high))}."
+            f"Weighted by {axis} ({shares}): right in {wording.percent(mean)}, "
+            f"95 % interval {wording.interval_text((low, high))}."
         )
     return lines
 
@@ -211,7 +225,9 @@ class DomainPart(NamedTuple):
         return ": ".join(filter(None, (self.variation.value, self.description)))
 
 
-def domain_of(result: Result, recorded: Sequence[RecordedSettings], searched: Sequence[str]) -> dict[str, DomainPart]:
+def domain_of(
+    result: results.Result, recorded: Sequence[RecordedSettings], searched: Sequence[str]
+) -> dict[str, DomainPart]:
     """Return the parts of an operational design domain by name: within what each varied, or what it was."""
     fixed = defaultdict[str, list[str]](list)
     fixed["place"].append(str(getattr(result, "environment", "") or stated(recorded, "environment")))
@@ -270,9 +286,9 @@ RULES = (
 QUICK = "Made by a quick recipe: few and small pictures, to see what comes out; no result."
 
 
-def claims_of(result: Result) -> list[Claim]:
+def claims_of(result: results.Result) -> list[Claim]:
     if result.goes_on:
-        state = "is running" if getattr(result, "ending", "") == RUNNING else "is not finished"
+        state = "is running" if getattr(result, "ending", "") == results.RUNNING else "is not finished"
         return [nothing_claimed(f"the run {state}" + (f"; so far: {result.brief}" if result.brief else ""))]
     if claims := get_experiment(result.command).claims:
         return list(claims(result)) or [nothing_claimed("nothing in this run came to its end")]
@@ -284,9 +300,9 @@ def photo_claims(photos: Any) -> list[Claim]:
     if not photos.photos or photos.interval is None:
         return []
     agreeing = photos.right_right + photos.wrong_wrong
-    extent = counted("photographs that agree", agreeing, photos.photos, photos.interval)
-    text = f"Photographs and renderings agree (both right, or both wrong) in {share_text(extent)}."
-    return [claim("measured", f"{text} The interval takes photographs as independent.", extent)]
+    extent = results.Extent.of("photographs that agree", agreeing, photos.photos, photos.interval)
+    text = f"Photographs and renderings agree (both right, or both wrong) in {wording.share_text(extent)}."
+    return [Claim(kind="measured", statement=f"{text} The interval takes photographs as independent.", extent=extent)]
 
 
 def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
@@ -303,13 +319,18 @@ def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
 
 
 NOT_NOTED = "not noted"
+NO_MAP = "none"  # the environment of a scene that has lights of its own
 NO_CLAIM = "The run carries no claim; it is listed so that it is not left out unseen."
 WEIGHTED = "How common the conditions are is what the weights say, of their axes alone."
 NOT_WEIGHTED = "Nothing is said of how common the conditions are: no weights were given."
 
 
 def evidence_of(
-    name: str, result: Result, claims: Sequence[Claim], recorded: Sequence[RecordedSettings], made: Mapping[str, str]
+    name: str,
+    result: results.Result,
+    claims: Sequence[Claim],
+    recorded: Sequence[RecordedSettings],
+    made: Mapping[str, str],
 ) -> EvidenceRun:
     """Return a run with what a reader needs to judge its claims: the settings that it recorded, its own first, and
     versions and digests as it noted them."""
@@ -320,7 +341,7 @@ def evidence_of(
     lit_by = str(values.get("environment") or "")
     moving = {name.partition(":")[0] for which in ("over", "controls") for name in values.get(which) or ()}
     if lit_by and {"environment", "sky"} & moving:
-        attacked = isinstance(result, AttackSummary)
+        attacked = is_attack(result)
         lit_by = f"varied, see below; the clean scene has {lit_by}" if attacked else f"{lit_by}, varied"
     about = {
         "Object": str(objects or ""),
@@ -350,10 +371,10 @@ def evidence_of(
     )  # fmt: skip
 
 
-def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
+def searched_lines(result: results.Result, settings: Mapping[str, object]) -> list[str]:
     lines = []
-    if isinstance(result, AttackSummary):
-        lines.append(shown(result).facts["changed"])
+    if is_attack(result):
+        lines.append(get_experiment(result.command).view(result).facts["changed"])
         lines += [
             f"{name}: {found.low:.4g} to {found.high:.4g} {found.unit}".rstrip()
             for name, found in (result.configuration or {}).items()
@@ -361,13 +382,13 @@ def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
         ]
         lines += [f"{' and '.join(result.over)}, drawn anew for every picture"] if result.over else []
         lines += [f"{name}: {_span(varied)}, by chance" for name, varied in result.conditions.items()]
-    elif isinstance(result, SweepSummary):
+    elif is_sweep(result):
         axes = dict[tuple[str, str], list[Any]]()
         for row in result.axes:
             if row.axis not in result.drawn:
                 axes.setdefault((row.axis, row.unit), []).append(row.value)
         for (axis, unit), values in axes.items():
-            text = ", ".join(map(number_text, values))
+            text = ", ".join(map(wording.number_text, values))
             if all(isinstance(value, tuple) for value in values):  # parts of one range
                 text = f"{min(low for low, _ in values):.4g} to {max(high for _, high in values):.4g}"
             lines.append(f"{axis}: {text} {unit}".rstrip())
@@ -379,21 +400,23 @@ def searched_lines(result: Result, settings: Mapping[str, object]) -> list[str]:
             lines.append(f"{control}, as set: {json.dumps(given, ensure_ascii=False)}")
         elif not any(line.startswith((control, f"{control}.")) for line in lines):
             lines.append(f"{control}: everything that it searches by default")
-    for name in () if isinstance(result, AttackSummary) else ("epsilon", "epsilons"):
+    for name in () if is_attack(result) else ("epsilon", "epsilons"):
         if settings.get(name) is not None:
             lines.append(f"{name}: {json.dumps(settings[name])}")
     return lines
 
 
-def _span(varied: VariedValue) -> str:
+def _span(varied: results.VariedValue) -> str:
     if varied.low is None or varied.high is None:
         return " or ".join(varied.names or ["something"])
     return f"{varied.low:.4g} to {varied.high:.4g} {'' if varied.unit == '1' else varied.unit}".rstrip()
 
 
-def _measured(result: Result, settings: Mapping[str, object], recorded: Sequence[RecordedSettings]) -> dict[str, str]:
+def _measured(
+    result: results.Result, settings: Mapping[str, object], recorded: Sequence[RecordedSettings]
+) -> dict[str, str]:
     tasks = [one.task for one in recorded if one.is_of_scene]
-    trials = "Trials of the worst configuration" if isinstance(result, SweepSummary) else "Trials"
+    trials = "Trials of the worst configuration" if is_sweep(result) else "Trials"
     facts = {
         "Policy": getattr(result, "policy", None),
         "Objective": getattr(result, "objective", None),
@@ -405,7 +428,7 @@ def _measured(result: Result, settings: Mapping[str, object], recorded: Sequence
         "Judged with": "; ".join(dict.fromkeys(tasks)),
     }
     named = {name: str(value) for name, value in facts.items() if value not in (None, "")}
-    if isinstance(result, AttackSummary) and result.verified is not None:
+    if is_attack(result) and result.verified is not None:
         rated, control = result.verified, result.clean.control
         counting = f"{rated.trials} renders with fresh seeds"
         if result.over and control is not None and control.trials > rated.trials:
@@ -416,21 +439,21 @@ def _measured(result: Result, settings: Mapping[str, object], recorded: Sequence
     return {**named, "Pictures": wording.formation_text(formation, gains)} if formation else named
 
 
-def _excluded(result: Result, claims: Sequence[Claim]) -> list[str]:
+def _excluded(result: results.Result, claims: Sequence[Claim]) -> list[str]:
     lines = ["Nothing varied but what stands under What varied, and the noise of the renders."]
-    if isinstance(result, AttackSummary):
-        lines += shown(result).cautions
+    if is_attack(result):
+        lines += get_experiment(result.command).view(result).cautions
         bad = result.non_finite
         if bad.objectives or bad.gradient_elements:
             lines.append(f"Not finite: {bad.objectives} objectives, {bad.gradient_elements} numbers of gradients.")
         lines += [
-            f"The clean scene has {moved.parameter} {number_text(moved.used)} {moved.unit} in place of "
-            f"{number_text(moved.scene)}: the control leaves that out."
+            f"The clean scene has {moved.parameter} {wording.number_text(moved.used)} {moved.unit} in place of "
+            f"{wording.number_text(moved.scene)}: the control leaves that out."
             for moved in result.clean.moved
         ]
-    if isinstance(result, SweepSummary) and result.not_finite:
+    if is_sweep(result) and result.not_finite:
         lines.append(f"{result.not_finite} predictions were not numbers; they count as not right.")
-    if isinstance(result, SweepSummary) and result.looked_at < result.planned:
+    if is_sweep(result) and result.looked_at < result.planned:
         lines.append(f"Only {result.looked_at} of {result.planned} planned configurations were looked at.")
     if all(claim.kind == "nothing claimed" for claim in claims):
         lines.append(NO_CLAIM)
@@ -448,17 +471,21 @@ def collected(
     told, pictures, folders = list[EvidenceRun](), dict[str, bytes](), dict[Path, Path]()
     models, digests = list[str](), list[str]()
     for folder in map(find_run, runs):
-        parts = [part for part in sorted((folder / PARTS).glob("*")) if is_run(part)]
+        parts = [part for part in sorted((folder / directory.PARTS).glob("*")) if directory.is_run(part)]
         of_recipe = parts and own_settings(folder).get("command") == "recipe"  # the runs that it consists of
         folders |= {part.resolve(): part for part in (parts if of_recipe else [folder])}
     for number, folder in enumerate(folders.values(), 1):
-        files = [folder / IMAGES / f"{name}.png" for name in PICTURES]
+        files = [folder / directory.IMAGES / f"{name}.png" for name in PICTURES]
         files = [file for file in files if file.is_file() and not file.is_symlink()][:3]
-        own = {f"pictures/{number}-{file.name}": read_bytes(file, "a picture", MOST_OF_PICTURE) for file in files}
+        own = {
+            f"pictures/{number}-{file.name}": stored_files.read_bytes(file, "a picture", MOST_OF_PICTURE)
+            for file in files
+        }
         pictures |= own
         run, begun = _run(folder, criterion, exposure or {}), ""
         with suppress(OSError):  # when its settings were written
-            begun = f"{datetime.fromtimestamp((folder / CONFIG).stat().st_mtime, timezone.utc):%Y-%m-%d %H:%M} UTC"
+            written = datetime.fromtimestamp((folder / directory.CONFIG).stat().st_mtime, timezone.utc)
+            begun = f"{written:%Y-%m-%d %H:%M} UTC"
         told.append(run.model_copy(update={"pictures": list(own), "begun": begun}))
         if model := run.about.get("Model"):
             of_model = model, model.rpartition("@")[2]
@@ -476,18 +503,18 @@ def collected(
 def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceRun:
     """One run; of one that has no summary, that it claims nothing."""
     settings = own_settings(folder)
-    if not (folder / SUMMARY).is_file():
+    if not (folder / directory.summary.NAME).is_file():
         facts = {"Object": str(settings.get("object") or ""), "Model": str(settings.get("model") or "")}
         return EvidenceRun(
-            run=typed_name(folder), command=str(settings.get("command") or "unknown"), ending="none yet",
+            run=directory.typed_name(folder), command=str(settings.get("command") or "unknown"), ending="none yet",
             claims=[nothing_claimed("the run has no result yet: it is still working, or was stopped")],
             about={key: text for key, text in facts.items() if text}, searched=[], measured={}, excluded=[NO_CLAIM],
             cost={}, made_with=made_with(folder, []) or {"versions and files": NOT_NOTED},
             settings=RecordedSettings("", settings).as_text(),
-            command_line=f"advsearch run {folder / CONFIG}",
+            command_line=f"advsearch run {folder / directory.CONFIG}",
         )  # fmt: skip
-    result, photographs, rows = read_result(folder), list[Claim](), list[Row]()
-    if (folder / PHOTOGRAPHS).is_dir():
+    result, photographs, rows = read_result(folder), list[Claim](), list[Any]()
+    if (folder / directory.PHOTOGRAPHS).is_dir():
         from advsearch.extend import workbench  # it brings torch, which takes a second
 
         photographs = photo_claims(workbench.load_photographs().agreement(folder))
@@ -498,9 +525,11 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
     read = [*sweeps, *attacks_read(settings)]
     recorded = recorded_settings(folder, result, read)
     made = made_with(folder, read)
-    if getattr(result, "environment", "") == NO_MAP:  # the scene has lights of its own
-        made.pop(f"bundled environment {DEFAULT_ENVIRONMENT}", None)
-    run = evidence_of(typed_name(folder), result, claims, recorded, made)
+    if getattr(result, "environment", "") == NO_MAP:
+        from advsearch.extend import workbench  # it brings torch, which takes a second
+
+        made.pop(f"bundled environment {workbench.DEFAULT_ENVIRONMENT}", None)
+    run = evidence_of(directory.typed_name(folder), result, claims, recorded, made)
     outer = own_settings(folder.resolve().parent.parent)
     few = [QUICK] if outer.get("command") == "recipe" and outer.get("quick") is True else []
     basis = []  # the sweeps whose rows it reads: it is about what varied there
@@ -540,13 +569,13 @@ def _searched_by_claims(claims: Mapping[str, Mapping[str, Any]] | None) -> list[
     if claims is None:
         return ["as the claims of its suite say, which cannot be read any more"]
     lines = defaultdict[str, list[str]](list)
-    for name, settings in claims.items():
-        controls = settings.get("controls") or {}
+    for name, claim_settings in claims.items():
+        controls = claim_settings.get("controls") or {}
         if not isinstance(controls, Mapping):
             controls = dict.fromkeys(str(controls).split(","))
         for control, given in controls.items():
             text = json.dumps(given, ensure_ascii=False) if given else "everything it searches by default"
             lines[f"{control}: {text}"].append(name)
-        if settings.get("environment"):
-            lines[f"environment: {settings['environment']}"].append(name)
+        if claim_settings.get("environment"):
+            lines[f"environment: {claim_settings['environment']}"].append(name)
     return [f"{line} ({', '.join(names)})" for line, names in lines.items()]

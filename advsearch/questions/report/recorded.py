@@ -10,21 +10,20 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from advsearch.config import CONFIGS
-from advsearch.errors import AdvsearchError
-from advsearch.options import FROM_RUN
-from advsearch.registry import get_experiment
-from advsearch.report.wording import number_text
-from advsearch.runs.directory import CONFIG, PARTS, find_run, is_run, typed_name
-from advsearch.runs.results import Result
-from advsearch.runs.store import NAME as STORE
-from advsearch.runs.store import Store
-from advsearch.runs.summary import MADE_WITH
-from advsearch.settings import Config, read_yaml, settings
-from advsearch.settings.configuration import PLACE
+from advsearch.extend import (
+    AdvsearchError,
+    Config,
+    RunDirectory,
+    directory,
+    find_run,
+    get_experiment,
+    results,
+    settings,
+    wording,
+)
 
 CLAIM = "claim"  # the kind of settings that a suite noted for each of its claims
-NOT_SETTINGS = ("schema", "command", "base", *PLACE)
+NOT_SETTINGS = ("schema", "command", "base", *settings.PLACE)
 ATTACKS = ("attack", "adversarial_of", "around")  # settings that name an attack's run
 DEFAULT_TASK = "classification"
 LONGEST = 2000  # characters of a value that are written
@@ -67,12 +66,13 @@ class RecordedSettings:
 
     @cached_property
     def _kind(self) -> type[Config] | None:
-        command = str(self.values.get("command") or "")
-        return CONFIGS[command] if command in CONFIGS else None
+        with suppress(AdvsearchError, KeyError):
+            return get_experiment(str(self.values.get("command") or "")).settings
+        return None
 
     @cached_property
     def _defaults(self) -> dict[str, Any]:
-        known = settings(self._kind) if self._kind else ()
+        known = settings.settings(self._kind) if self._kind else ()
         return {setting.name: None if setting.required else setting.default for setting in known}
 
     @cached_property
@@ -89,7 +89,9 @@ class RecordedSettings:
 def task_text(named: Any, objective: object) -> str:
     """Return a task in words, with all its options, such as thresholds, also those that are default; an objective of
     its own says what counts as success."""
-    options = ", ".join(f"{option} {number_text(given)}" for option, given in _task_options(named, objective).items())
+    options = ", ".join(
+        f"{option} {wording.number_text(given)}" for option, given in _task_options(named, objective).items()
+    )
     called = str(named.get("name") if isinstance(named, Mapping) else named)
     return f"{called} ({options})" if options else _short(named)
 
@@ -100,18 +102,17 @@ def _short(value: object) -> str:
 
 
 def _task_options(named: Any, objective: object) -> dict[str, Any]:
-    from advsearch.tasks import make_task  # they bring torch, which takes a second
-    from advsearch.tasks.together import Together
+    from advsearch.extend import workbench  # it brings torch, which takes a second
 
     options = dict[str, Any]()
     with suppress(AdvsearchError):
-        task = make_task(named)
+        task = workbench.make_task(named)
         task = task.seeking(objective) if isinstance(objective, str) else task
-        parts = {f"{part.name}.": part for part in task.parts} if isinstance(task, Together) else {"": task}
+        parts = {f"{part.name}.": part for part in task.parts} if isinstance(task, workbench.Together) else {"": task}
         for before, part in parts.items():
             for option in fields(part):
                 value = getattr(part, option.name)
-                if option.metadata != FROM_RUN and value not in (None, "", (), False):
+                if option.metadata != workbench.FROM_RUN and value not in (None, "", (), False):
                     options[f"{before}{option.name}"] = value
     return options
 
@@ -119,17 +120,11 @@ def _task_options(named: Any, objective: object) -> dict[str, Any]:
 def own_settings(folder: Path) -> Mapping[str, Any]:
     """Return what the `run.yaml` of a run says; nothing where it cannot be read."""
     with suppress(AdvsearchError):
-        return read_yaml(folder / CONFIG)
+        return settings.read_yaml(folder / directory.CONFIG)
     return {}
 
 
-def noted(folder: Path, note: str) -> Any:
-    with suppress(AdvsearchError), Store(folder / STORE, read_only=True) as store:
-        return store.noted(note)
-    return None
-
-
-def sweeps_read(result: Result) -> list[Path]:
+def sweeps_read(result: results.Result) -> list[Path]:
     """Return the folders of the sweeps whose rows a result was made from, as far as they are there."""
     return _found([*getattr(result, "sweeps", ()), *(side.run for side in getattr(result, "sides", ()))])
 
@@ -147,16 +142,16 @@ def _found(names: Iterable[object]) -> list[Path]:
     return folders
 
 
-def recorded_settings(folder: Path, result: Result, read: Sequence[Path]) -> list[RecordedSettings]:
+def recorded_settings(folder: Path, result: results.Result, read: Sequence[Path]) -> list[RecordedSettings]:
     """Return the settings of a run: its own, of a suite those of each claim and counterexample that was tried, and
     those of the runs that it read."""
     recorded = [RecordedSettings("", own_settings(folder))]
     for kind, settings_by_name in (noted_settings(folder, result) or {}).items():
         recorded += [RecordedSettings(f"{kind} {name}", values) for name, values in settings_by_name.items()]
-    return recorded + [RecordedSettings(typed_name(path), own_settings(path)) for path in read]
+    return recorded + [RecordedSettings(directory.typed_name(path), own_settings(path)) for path in read]
 
 
-def noted_settings(folder: Path, result: Result) -> Mapping[str, Mapping[str, Mapping[str, Any]]] | None:
+def noted_settings(folder: Path, result: results.Result) -> Mapping[str, Mapping[str, Mapping[str, Any]]] | None:
     """Return what a run noted of settings beside its own, by kind and name; None for an experiment that notes none."""
     hook = get_experiment(result.command).noted_settings
     if hook is None:
@@ -176,9 +171,9 @@ def made_with(folder: Path, read: Sequence[Path]) -> dict[str, str]:
     """Return versions and digests of files, of a run, of the runs that it consists of and of those that it read; of
     several that differ, all."""
     found = dict[str, dict[str, None]]()
-    parts = [part for part in sorted((folder / PARTS).glob("*")) if is_run(part)]
+    parts = [part for part in sorted((folder / directory.PARTS).glob("*")) if directory.is_run(part)]
     for run in [folder, *parts, *read]:
-        facts = noted(run, MADE_WITH)
-        for name, text in facts.items() if isinstance(facts, Mapping) else ():
-            found.setdefault(str(name), {})[str(text)] = None
+        with suppress(AdvsearchError):
+            for name, text in RunDirectory.read_made_with(run).items():
+                found.setdefault(name, {})[str(text)] = None
     return {name: ", then ".join(texts) for name, texts in found.items()}

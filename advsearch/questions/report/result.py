@@ -8,10 +8,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.report.shown import Claim, Html, element, join_html
-from advsearch.report.wording import count, interval_text
-from advsearch.runs.results import Fields, Interval, Result, optional
-from advsearch.viewer.document import data_url, document, heading, study_table
+from advsearch.extend import Claim, Fields, Interval, markup, results, wording
 
 
 class ConditionShare(Fields):
@@ -57,7 +54,7 @@ class EvidenceRun(Fields):
     command_line: str = Field(description="what repeats it")
 
 
-class Evidence(Result):
+class Evidence(results.Result):
     """Runs as evidence, for a model card or a safety case."""
 
     command: ClassVar[str] = "report"
@@ -68,7 +65,7 @@ class Evidence(Result):
     version: str = Field(description="of advsearch, that wrote this")
     written: str = Field("", description="when, UTC")
     by: str = Field("", description="who, as given; absent otherwise")
-    criterion: float | None = optional("share of right predictions that was asked for; absent otherwise")
+    criterion: float | None = results.optional("share of right predictions that was asked for; absent otherwise")
 
 
 def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[str]]]]:
@@ -77,7 +74,10 @@ def tables_of(run: EvidenceRun) -> Iterator[tuple[str, Sequence[str], list[list[
         ("Photographs that agree", "photographs of", "agree", run.photographs),
     ):
         if conditions:
-            rows = [[row.condition, str(row.right), str(row.total), interval_text(row.interval)] for row in conditions]
+            rows = [
+                [row.condition, str(row.right), str(row.total), wording.interval_text(row.interval)]
+                for row in conditions
+            ]
             yield title, (first, verb, "of", "95 % interval"), rows
 
 
@@ -136,36 +136,44 @@ CLAIM_HEADS = ("claim", "in words", "counted", "95 % interval")
 def evidence_page(evidence: Evidence, pictures: Mapping[str, bytes] | None = None) -> str:
     claims = [claim for run in evidence.runs for claim in run.claims]
     carried = sum(claim.kind != "nothing claimed" for claim in claims)
-    said = f"What {count(len(evidence.runs), 'run')} show{'s' * (len(evidence.runs) == 1)}, and no more than that."
-    main = element(
-        "main", *(_run_html(run, pictures or {}) for run in evidence.runs), element("h2", "How to read this"),
-        element("ul", *(element("li", text.replace("`", "")) for text in evidence.rules)),
-        element("p", _signed(evidence), class_="soft"),
+    said = (
+        f"What {wording.count(len(evidence.runs), 'run')} show{'s' * (len(evidence.runs) == 1)}, and no more than that."
+    )
+    main = markup.element(
+        "main", *(_run_html(run, pictures or {}) for run in evidence.runs), markup.element("h2", "How to read this"),
+        markup.element("ul", *(markup.element("li", text.replace("`", "")) for text in evidence.rules)),
+        markup.element("p", _signed(evidence), class_="soft"),
     )  # fmt: skip
-    header = heading(f"evidence; {carried} of {len(claims)} statements carry a claim", said, evidence.warnings)
-    return document("evidence", header, main, footer="evidence. This page needs no other file.")
+    header = markup.heading(f"evidence; {carried} of {len(claims)} statements carry a claim", said, evidence.warnings)
+    return markup.document("evidence", header, main, footer="evidence. This page needs no other file.")
 
 
-def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> Html:
+def _run_html(run: EvidenceRun, pictures: Mapping[str, bytes]) -> markup.Html:
     rows = []
     for claim in run.claims:
         extent = claim.extent
-        counted = [f"{extent.count} of {extent.total}", interval_text(extent.interval)] if extent else ["", ""]
+        counted = [f"{extent.count} of {extent.total}", wording.interval_text(extent.interval)] if extent else ["", ""]
         rows.append([claim.kind, claim.statement, *counted])
-    parts = [element("h2", f"{run.run} ({run.command})"), study_table(CLAIM_HEADS, rows)]
+    parts = [markup.element("h2", f"{run.run} ({run.command})"), markup.study_table(CLAIM_HEADS, rows)]
     if run.pictures:
-        data = {name: data_url(pictures[name], "image/png") for name in run.pictures if name in pictures}
-        images = (element("figure", element("img", src=url, alt=name)) for name, url in data.items())
-        parts.append(element("div", *images, class_="pictures"))
+        data = {name: markup.data_url(pictures[name], "image/png") for name in run.pictures if name in pictures}
+        images = (markup.element("figure", markup.element("img", src=url, alt=name)) for name, url in data.items())
+        parts.append(markup.element("div", *images, class_="pictures"))
     for title, heads, cells in tables_of(run):
-        summary = element("summary", f"{title} by condition, {len(cells)} rows")
-        parts.append(element("details", summary, study_table(heads, cells)))
+        summary = markup.element("summary", f"{title} by condition, {len(cells)} rows")
+        parts.append(markup.element("details", summary, markup.study_table(heads, cells)))
     facts = [
-        element("tr", element("th", name, scope="row"), element("td", *(element("div", line) for line in lines)))
+        markup.element(
+            "tr",
+            markup.element("th", name, scope="row"),
+            markup.element("td", *(markup.element("div", line) for line in lines)),
+        )
         for name, lines in sections(run).items()
     ]
-    table = element("table", element("tbody", *facts), class_="facts")
-    parts.append(element("details", element("summary", "On what, how, and what is left out"), table, open=""))
+    table = markup.element("table", markup.element("tbody", *facts), class_="facts")
+    parts.append(
+        markup.element("details", markup.element("summary", "On what, how, and what is left out"), table, open="")
+    )
     if run.command_line:
-        parts += [element("h2", "Do it again"), element("pre", run.command_line, class_="wrap")]
-    return join_html(*parts)
+        parts += [markup.element("h2", "Do it again"), markup.element("pre", run.command_line, class_="wrap")]
+    return markup.join_html(*parts)
