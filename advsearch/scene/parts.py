@@ -44,6 +44,13 @@ class Footprint(NamedTuple):
     high: float
 
 
+class Solid(NamedTuple):
+    """What nothing else can be in, and what it is called in a sentence: "a house"."""
+
+    name: str
+    footprint: Footprint
+
+
 @dataclass(frozen=True, eq=False)
 class MeshPart(Shape, ScenePart):
     """A shape in the scene; "object" is the object itself.
@@ -56,7 +63,8 @@ class MeshPart(Shape, ScenePart):
 
     to_world: Doubles = field(default_factory=lambda: np.eye(4))  # (4, 4) its base pose
     laid: bool = False  # it belongs to the ground that the scene has by itself, and goes with it
-    solids: tuple[Footprint, ...] = ()  # of what is laid: what nothing else can be in, in object sizes
+    is_ground: bool = False  # of what is laid: things stand on it
+    solids: tuple[Solid, ...] = ()  # of what is laid: what nothing else can be in, in object sizes
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,11 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.grounds import LUMINANCE, enclosed, paved
-from advsearch.scene.places.avenue import AVENUE, END, KERB, LAMP_HEIGHT, lamp_places
-from advsearch.scene.places.paint import FRONTS
-from advsearch.scene.places.quads import KERBS, ROAD, SHOWN, Quads, Wall
+from advsearch.scene.places.road import KERBS, ROAD
 from advsearch.scene.things import ground_height
+from scenes.places.avenue import AVENUE, END, KERB, LAMP_HEIGHT, lamp_places
+from scenes.places.paint import FRONTS
+from scenes.places.quads import SHOWN, Quads, Wall
 
 
 def laid(scene: SceneDescription) -> set[str]:
@@ -81,7 +82,7 @@ def test_snow_lies_on_what_faces_up_and_on_nothing_else() -> None:
 def test_boxes_at_a_wall_face_outwards() -> None:
     frame, quads = Wall((1.0, 2.0, 0.0), (-1.0, 0.0, 0.0)), Quads()
     quads.boxes(frame, np.array([[0.0, 2.0, 0.0, 0.5, 1.0, 1.3]]), np.array([[0.0, 1.0, 0.0, 1.0]]), SHOWN)
-    mesh = quads.mesh(1.0)
+    mesh = quads.mesh()
     middle = mesh.vertices.mean(axis=0)
     away = mesh.vertices[mesh.faces].mean(axis=1) - middle
     assert ((mesh.normals[mesh.faces[:, 0]] * away).sum(axis=1) > 0.0).all()

@@ -14,7 +14,7 @@ from advsearch.errors import InputError
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.grounds import paved
-from advsearch.scene.places.quads import ROAD, reflectance
+from advsearch.scene.places.road import ROAD, reflectance
 from advsearch.scene.raster import texels_of_faces
 
 SIZE = 16

@@ -22,7 +22,7 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import glb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import import_scene
-from advsearch.scene.places.quads import ROAD
+from advsearch.scene.places.road import ROAD
 
 
 def box(folder: Path, name: str, longest: float) -> Path:
