@@ -15,10 +15,8 @@ from torch import Tensor
 from advsearch.scene import settings
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Mesh
 from advsearch.scene.geometry import camera_to_world, middle
-from advsearch.scene.library import BUNDLED_ENVIRONMENT
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.places.place_file import Place, lay_place, load_bundled_place
-from advsearch.scene.places.road import EDGES, EYE, FRONTS, LENGTH, STREET_ENDS, road
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -108,7 +106,7 @@ def paved(scene: SceneDescription) -> bool:
 def has_lanes(scene: SceneDescription) -> bool:
     """Tell whether the object stands in a lane, where what faces +x drives along it."""
     place = find_place(scene)
-    return paved(scene) and (place is None or place.file.lane_width is not None)
+    return place is not None and place.file.lane_width is not None
 
 
 LANE_WIDTH = 3.5  # metres, of the lane that the object stands in where no place says it
@@ -141,6 +139,8 @@ def enclosed(scene: SceneDescription) -> bool:
 
 
 PLACES: Mapping[str, tuple[str, str | None]] = {
+    settings.DRY_ROAD: ("road", None),
+    settings.WET_ROAD: ("road", "wet"),
     settings.DRY_AVENUE: ("avenue", None),
     settings.WET_AVENUE: ("avenue", "wet"),
     settings.SNOW_AVENUE: ("avenue", "snow"),
@@ -176,7 +176,6 @@ def find_place(scene: SceneDescription) -> Place | None:
 
 def on_its_ground(scene: SceneDescription) -> SceneDescription:
     """Return the scene with the road or the place that its environment and its settings ask for, and no other."""
-    kind = find_ground_kind(scene)
     others = tuple(part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid))
     place = find_place(scene)
     if place is not None:
@@ -187,8 +186,6 @@ def on_its_ground(scene: SceneDescription) -> SceneDescription:
             arriving = irradiance(torch.from_numpy(light.radiance.copy()))
             is_dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
         return replace(scene, parts=(*others, *lay_place(place, scene.metres, unit, is_dark=is_dark)))
-    if kind in settings.ROADS:
-        return replace(scene, parts=(*others, road(kind == settings.WET_ROAD, scene.metres)))
     return scene if len(others) == len(scene.parts) else replace(scene, parts=others)
 
 
@@ -261,16 +258,24 @@ def surroundings_of(scene: SceneDescription) -> Surroundings | None:
     lit = scene.environment
     if lit is None or scene.backdrop or enclosed(scene):  # what encloses the object is geometry, true from everywhere
         return None
-    if find_place(scene) is not None:  # which says itself where it holds
-        return None
-    laid: Box | float = (-LENGTH / 2.0, LENGTH / 2.0, *EDGES) if paved(scene) else math.inf
-    if lit.ground is not None and lit.source == BUNDLED_ENVIRONMENT and paved(scene):
-        stands = (-STREET_ENDS, STREET_ENDS, *FRONTS)
-        return Surroundings(EYE, stands, laid, scene.number("environment.rotation"))
+    place = find_place(scene)
+    laid: Box | float = math.inf if place is None else bound_ground(place)
+    bundled = PLACES.get(lit.ground or "")
+    shown = lit.place if bundled is None else load_bundled_place(*bundled)
+    if place is not None and shown is not None and shown.file.picture is not None:
+        picture = shown.file.picture
+        return Surroundings(picture.height, (*picture.x, *picture.y), laid, scene.number("environment.rotation"))
     if lit.photographed and (paved(scene) or scene.photograph is not None):
         height, radius = scene.capture_height * scene.metres, scene.values.get("ground.radius")
         return Surroundings(height, RADIUS * height if radius is None else radius, laid)
     return Surroundings(math.inf, math.inf, laid) if paved(scene) else None
+
+
+def bound_ground(place: Place) -> Box:
+    """Return from where to where the ground of a place reaches in x and in y, metres."""
+    vertices = np.concatenate([part.mesh.vertices for part in place.parts if part.is_ground])
+    (x0, y0), (x1, y1) = vertices[:, :2].min(axis=0).tolist(), vertices[:, :2].max(axis=0).tolist()
+    return x0, x1, y0, y1
 
 
 def view_of(scene: SceneDescription, to_world: Doubles | None = None, fov: float | None = None) -> CameraView:
@@ -299,10 +304,9 @@ def past(scene: SceneDescription, views: Sequence[CameraView], *, turns: bool = 
     """Return what is said where views of a scene, at least one, go past what its environment's picture is valid for;
     `turns`: that is turned from view to view."""
     around, place = surroundings_of(scene), find_place(scene)
-    if place is not None:
-        return remark_outside(scene, place, views)
-    if around is None:
-        return ()
+    outside = () if place is None else remark_outside(scene, place, views)
+    if outside or around is None:
+        return outside
     name, unit = scene.environment_name, "m" if scene.object.metres is not None else "object sizes"
     if valid(around, views[0]) == (0.0, 0.0) or (turns and isinstance(around.stands, tuple)):
         return (

@@ -16,11 +16,11 @@ import numpy as np
 
 from advsearch.scene.assets import Doubles, Floats, Material
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.places.road import DRY, KERBS, WET, shown
 from scenes.places import paint
 from scenes.places.houses import DEPTH, Fronts
 from scenes.places.models import Look, Node, PlaceModel, Primitive, make_primitive
 from scenes.places.quads import FRONT, SHOWN, Quads, Wall
+from scenes.places.road import DRY, KERBS, WET, shown
 
 END, CROSSING, FAR = 150.0, 12.0, 4000.0  # where the street ends, how wide what it meets is, how far the plain goes
 KERB = 0.12

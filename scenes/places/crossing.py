@@ -10,13 +10,13 @@ import numpy as np
 from advsearch.scene.assets import Mesh
 from advsearch.scene.geometry import rotation
 from advsearch.scene.library import load_object
-from advsearch.scene.places.road import KERBS
 from scenes.places import avenue, paint
 from scenes.places.avenue import END, KERB, StreetPlan, Tree, asphalt, level, painted, street
 from scenes.places.houses import DEPTH
 from scenes.places.models import Look, Node, Primitive, make_primitive
 from scenes.places.paint import BAY, FRONTS
 from scenes.places.quads import FRONT, TOP, Quads, Wall
+from scenes.places.road import KERBS
 
 AHEAD = 14.0  # x of the middle of the other street, which is as wide
 MIDDLE = sum(KERBS) / 2.0

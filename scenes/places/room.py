@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from advsearch.scene.assets import Doubles, Floats, Material
-from advsearch.scene.places.road import shown
 from scenes.places.models import Look, Node, PlaceModel, make_primitive
 from scenes.places.paint import _clouds, _grain, tint
 from scenes.places.quads import FRONT, SHOWN, Quads, Wall
+from scenes.places.road import shown
 
 LOW, HIGH = (-1.75, -2.0, -0.75), (2.6, 1.9, 1.85)  # corners of the room
 TABLE, THICK = ((-0.45, 0.45), (-0.8, 0.8)), 0.035  # from and to in x and y of its top, which is at height 0

@@ -11,7 +11,6 @@ from advsearch.scene import library
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import standing
 from advsearch.scene.grounds import LUMINANCE, enclosed, paved
-from advsearch.scene.places.road import ROAD
 from advsearch.scene.things import footprint, overlapping
 from scenes.places import crossing, room
 from scenes.places.avenue import KERB, StreetPlan, lamp_places
@@ -43,7 +42,7 @@ def test_a_place_comes_with_its_environment_and_its_faces_look_outwards(place: s
 def test_nothing_stands_where_the_object_is(place: str) -> None:
     scene = describe(PLACES[place], place)
     thing, low = footprint(scene.base_vertices * scene.metres), -0.001
-    ground = (ROAD, "floor", "plain")
+    ground = ("road", "floor", "plain")
     for name, part in scene.around.items():
         if name in ground:
             continue
@@ -87,7 +86,7 @@ def test_the_crossing_has_a_stop_sign_that_faces_who_comes_and_a_zebra_ahead() -
     assert np.ptp(sign[:, 2]) == pytest.approx(library.load_object("stop-sign").metres, rel=1e-3)
     face = scene.around["sign"].mesh
     assert face.normals[face.faces].mean(axis=(0, 1))[0] < -0.9  # it faces where the object comes from
-    road = metres(scene)[ROAD]
+    road = metres(scene)["road"]
     paint = road[np.abs(road[:, 2] - 0.004) < 1e-4]
     zebra = paint[(np.abs(paint[:, 0] - crossing.ZEBRA[0]) < 1e-3) & (paint[:, 1] > -2.0) & (paint[:, 1] < 5.6)]
     widths = np.diff(np.unique(np.round(zebra[:, 1], 3)))

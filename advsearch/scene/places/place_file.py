@@ -93,6 +93,21 @@ class ValidEntry(_Entry):
         return self
 
 
+class PictureEntry(_Entry):
+    """What stands around, where the maps of the light show it: it fits the ground from near that place only."""
+
+    height: Positive  # above the ground from which the maps were taken
+    x: Bounds  # from and to, of what stands nearest
+    y: Bounds
+
+    @model_validator(mode="after")
+    def _check_inside(self) -> PictureEntry:
+        for axis, (low, high) in (("x", self.x), ("y", self.y)):
+            if not low < 0.0 < high:
+                raise ValueError(f"{axis}: expected bounds on both sides of the object, at 0")
+        return self
+
+
 class LightEntry(_Entry):
     """A light that the place may stand in."""
 
@@ -113,6 +128,7 @@ class PlaceFile(_Entry):
     """Luminance in cd/m2, for each colour channel, of meshes that shine when it is dark, and only then."""
     solids: Annotated[list[SolidEntry], Field(max_length=MOST_SOLIDS)] = []
     valid: ValidEntry = ValidEntry()
+    picture: PictureEntry | None = None  # None: nothing near is in the maps alone
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,15 +6,13 @@ the pavements, and far ahead, the environment's map is seen.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from advsearch.scene.assets import Doubles, Floats, Material, Mesh
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.parts import MeshPart
+from scenes.places.models import Look, Node, PlaceModel, Primitive
 
-ROAD = "road"  # name of the mesh: asphalt with markings between two pavements, dry or wet
 KERBS = (-2.3, 5.8)  # where the road ends on the right and on the left
 EDGES = (-10.0, 13.6)  # where the pavements end: a multiple of their slabs
 EYE, FRONTS, STREET_ENDS = 1.5, (-12.0, 15.6), 170.0
@@ -46,26 +44,33 @@ def reflectance(x: Doubles, y: Doubles, grain: Doubles | None = None) -> Doubles
     return np.where((np.abs(off) < 0.012)[:, None], 0.05, shade)
 
 
-@lru_cache(maxsize=4)
-def road(wet: bool, metres: float) -> MeshPart:
-    """Return the road, dark and reflecting where it is wet; `metres` are those of one object size."""
+def make_road() -> PlaceModel:
+    """Return the road, dark and reflecting where it is wet, with the streets' maps around it."""
     corners = np.array([[-1.0, EDGES[0]], [1.0, EDGES[0]], [1.0, EDGES[1]], [-1.0, EDGES[1]]])
     places = corners * np.array([LENGTH / 2, 1.0])
     uvs = np.stack([places[:, 0] / PERIOD, (places[:, 1] - EDGES[0]) / (EDGES[1] - EDGES[0])], axis=1)
     mesh = Mesh(
-        np.concatenate([places, np.zeros((4, 1))], axis=1).astype(np.float32) / np.float32(metres),
+        np.concatenate([places, np.zeros((4, 1))], axis=1).astype(np.float32),
         np.array([[0, 1, 2], [0, 2, 3]], np.uint32),
         np.tile(np.array([[0, 0, 1]], np.float32), (4, 1)),
         uvs.astype(np.float32),
     )
-    return MeshPart(ROAD, mesh, _texture(wet), WET if wet else DRY, laid=True, is_ground=True)
+    looks = {"road": Look(_texture(False), DRY), "wet-road": Look(_texture(True), WET)}
+    file = {
+        "ground": ["road"],
+        "lane_width": 3.5,
+        "lights": {
+            "day": {"map": "street"},
+            "wet": {"map": "street-wet", "variant": "wet"},
+            "dusk": {"map": "street-dusk"},
+        },
+        "picture": {"height": EYE, "x": [-STREET_ENDS, STREET_ENDS], "y": list(FRONTS)},
+    }
+    return PlaceModel(looks, [Node([Primitive(mesh, "road", {"wet": "wet-road"})])], file)
 
 
-@lru_cache(maxsize=2)
 def _texture(wet: bool) -> Floats:
     """One period of the road, (h, w, 3) display-referred, multiples of 1/255, row 0 on the left."""
-    from scipy.ndimage import uniform_filter  # few scenes have this road
-
     width, height = round(PERIOD / TEXEL), round((EDGES[1] - EDGES[0]) / TEXEL)
     fine = np.random.Generator(np.random.PCG64(7)).random((height, width))
     grain = np.zeros_like(fine)
