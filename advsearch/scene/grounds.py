@@ -165,6 +165,11 @@ def find_ground_kind(scene: SceneDescription) -> str | None:
 
 
 def find_place(scene: SceneDescription) -> Place | None:
+    """Return the place that a scene has around its object; None where it has none."""
+    return next((part.place for part in scene.around.values() if part.place is not None), None)
+
+
+def load_requested_place(scene: SceneDescription) -> Place | None:
     """Return the place that a scene's environment and its settings ask for; None where they ask for none."""
     kind = find_ground_kind(scene)
     if kind is not None:
@@ -177,7 +182,7 @@ def find_place(scene: SceneDescription) -> Place | None:
 def on_its_ground(scene: SceneDescription) -> SceneDescription:
     """Return the scene with the road or the place that its environment and its settings ask for, and no other."""
     others = tuple(part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid))
-    place = find_place(scene)
+    place = load_requested_place(scene)
     if place is not None:
         light = scene.environment
         unit = None if light is None else light.candelas

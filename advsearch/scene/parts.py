@@ -10,11 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
-from typing import ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
 from advsearch.scene.assets import Doubles, Floats, Ints, Material, Shape, pose_of
+
+if TYPE_CHECKING:
+    from advsearch.scene.places.place_file import Place
 
 Triple = tuple[float, float, float]
 BASE_COLOR = "base color"  # the type that stands for the texture in a surface in Mitsuba's words
@@ -62,9 +65,14 @@ class MeshPart(Shape, ScenePart):
     """
 
     to_world: Doubles = field(default_factory=lambda: np.eye(4))  # (4, 4) its base pose
-    laid: bool = False  # it belongs to the ground that the scene has by itself, and goes with it
-    is_ground: bool = False  # of what is laid: things stand on it
-    solids: tuple[Solid, ...] = ()  # of what is laid: what nothing else can be in, in object sizes
+    place: Place | None = None  # which it belongs to, and goes with
+    is_ground: bool = False  # of a place: things stand on it
+    solids: tuple[Solid, ...] = ()  # of a place: what nothing else can be in, in object sizes
+
+    @property
+    def laid(self) -> bool:
+        """Whether it belongs to the ground that the scene has by itself."""
+        return self.place is not None
 
 
 @dataclass(frozen=True, eq=False)

@@ -186,13 +186,13 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
                 raise UnknownNameError(f"mesh of {file.mesh}:", name, names, f"It stands in {path}.")
     solids = tuple(Solid(entry.name, outline) for entry in file.solids for outline in entry.list_footprints())
     placed = [
-        replace(part, laid=True, is_ground=part.name in file.ground, solids=solids if number == 0 else ())
+        replace(part, is_ground=part.name in file.ground, solids=solids if number == 0 else ())
         for number, part in enumerate(parts)
     ]
     return Place(safe_name(path.parent), file, tuple(placed), tuple(notes))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def load_bundled_place(name: str, variant: str | None = None) -> Place:
     """Return a bundled place. Raises FileFormatError: the installation is damaged."""
     with resources.as_file(resources.files("advsearch.bundled") / "data" / "places" / name) as folder:
@@ -223,5 +223,7 @@ def lay_place(place: Place, metres: float, candelas: float | None, *, is_dark: b
             for name, (outline, low, high) in part.solids
         )
         mesh = replace(part.mesh, vertices=part.mesh.vertices / np.float32(metres))
-        laid.append(replace(part, mesh=mesh, solids=solids, emission=None if emission is None else emission / unit))
+        laid.append(
+            replace(part, place=place, mesh=mesh, solids=solids, emission=None if emission is None else emission / unit)
+        )
     return tuple(laid)
