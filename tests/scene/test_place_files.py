@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,8 @@ from advsearch.scene.library import import_environment, load_environment
 from advsearch.scene.places.place_file import is_place_file, load_bundled_place, read_place_file, split_light
 from scenes.files import exr
 from scenes.places import PLACES
+from scenes.places.models import Look, Node, PlaceModel, Primitive
+from scenes.places.models import glb as write_glb
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -242,3 +245,30 @@ def test_a_road_before_a_picture_holds_as_far_as_the_bundled_street_does() -> No
     own, street = (describe("car", name, given=given) for name in (BUNDLED / "road" / "place.yaml", "street"))
     assert surroundings_of(own) == surroundings_of(street)
     assert "the place around the object is a picture" in past(own, [view_of(own)])[0]
+
+
+def test_a_variant_keeps_the_name_of_what_it_changes_as_a_whole(street: Path) -> None:
+    """A wet road is still the road; snow on a part of a house is a mesh of its own."""
+    road, house = box("road", (-40, -8, -0.5), (40, 8, 0), 0.3).mesh, box("house", (-10, 5, 0), (10, 9, 6), 0.6).mesh
+    walls, roof = (replace(house, faces=house.faces[part]) for part in (slice(0, 10), slice(10, 12)))
+    grey, white = np.full(3, 0.4, np.float32), np.full(3, 0.9, np.float32)
+    dull = Material(roughness=0.9)
+    looks = {
+        "road": Look(grey, dull),
+        "wet-road": Look(grey, Material(roughness=0.1, specular=0.6, clearcoat=0.5)),
+        "house": Look(grey, dull),
+        "snow": Look(white, dull),
+    }
+    nodes = [
+        Node([Primitive(road, "road", {"wet": "wet-road"})]),
+        Node([Primitive(walls, "house"), Primitive(roof, "house", {"snow": "snow"})]),
+    ]
+    (street.parent / "street.glb").write_bytes(write_glb(PlaceModel(looks, nodes, {})))
+    lights = {name: {"map": "sky.exr", "variant": name} for name in ("wet", "snow")}
+    write(street, lamps={}, lights={"dry": {"map": "sky.exr"}, **lights})
+    dry, wet, snow = (describe("car", f"{street}#{light}").around for light in ("dry", "wet", "snow"))
+    assert set(dry) == set(wet) == {"road", "house"} and set(snow) == {"road", "house", "snow"}
+    assert wet["road"].material == Material(roughness=0.1, specular=0.6, clearcoat=0.5)
+    assert dry["road"].material == dull
+    assert len(dry["house"].mesh.faces) == 12 == len(snow["house"].mesh.faces) + len(snow["snow"].mesh.faces)
+    assert (snow["snow"].mesh.normals[:, 2] == 1.0).all() and snow["snow"].base_color.max() > 0.89
