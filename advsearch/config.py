@@ -109,7 +109,8 @@ class SceneConfig(Config):
     )
     environment: str | None = setting(
         None, "scene", "the environment map that lights the scene",
-        "the name of an environment, a .hdr or .exr file, or none", otherwise=DEFAULT_ENVIRONMENT,
+        "the name of an environment, a .hdr or .exr file, the .yaml file of a place, or none",
+        otherwise=DEFAULT_ENVIRONMENT,
     )
     up: Literal["y", "z"] | None = setting(
         None, "scene", "which axis of an imported object points up",

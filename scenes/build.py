@@ -11,6 +11,7 @@ import io
 import itertools
 import json
 import math
+import struct
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import yaml
 from PIL import Image
 
 from advsearch.questions.harden.objects import OBJECTS, ObjectFamily
@@ -25,6 +27,7 @@ from advsearch.scene.assets import Mesh
 from advsearch.scene.importing.hdr import read_exr
 from scenes.environments import ENVIRONMENTS, EnvironmentFamily
 from scenes.files import exr, ply, png
+from scenes.places import PLACES, place_files
 
 Floats = npt.NDArray[np.float32]
 
@@ -85,6 +88,8 @@ def everything() -> Iterator[tuple[str, bytes]]:
         yield from object_files(thing).items()
     for light in ENVIRONMENTS.values():
         yield from environment_files(light).items()
+    for name, make in PLACES.items():
+        yield from place_files(name, make()).items()
     facts = {
         name: {"split": family.split, "source": family.script}
         | ({"ground": family.ground} if family.ground else {})
@@ -99,10 +104,17 @@ def is_close(name: str, stored: bytes, made: bytes) -> bool:
     """Return whether a stored file is what was made, but for rounding; `name` says what it is."""
     if stored == made:
         return True
-    compare = {".ply": _is_close_mesh, ".png": _is_close_image, ".exr": _is_close_map, ".json": _is_close_facts}
+    compare = {
+        ".ply": _is_close_mesh,
+        ".png": _is_close_image,
+        ".exr": _is_close_map,
+        ".json": _is_close_facts,
+        ".glb": _is_close_glb,
+        ".yaml": _is_close_yaml,
+    }
     try:
         return Path(name).suffix in compare and compare[Path(name).suffix](stored, made)
-    except (ValueError, OSError, RuntimeError):  # a damaged file
+    except (ValueError, OSError, RuntimeError, KeyError, struct.error, yaml.YAMLError):  # a damaged file
         return False
 
 
@@ -143,6 +155,41 @@ def _is_close_map(stored: bytes, made: bytes) -> bool:
 
 def _is_close_facts(stored: bytes, made: bytes) -> bool:
     return _is_close_value(json.loads(stored), json.loads(made))
+
+
+def _is_close_yaml(stored: bytes, made: bytes) -> bool:
+    return _is_close_value(yaml.safe_load(stored), yaml.safe_load(made))
+
+
+def _is_close_glb(stored: bytes, made: bytes) -> bool:
+    (first_header, first_parts), (second_header, second_parts) = _read_glb(stored), _read_glb(made)
+    if not _is_close_value(first_header, second_header) or len(first_parts) != len(second_parts):
+        return False
+    return all(map(_is_close_part, first_parts, second_parts))
+
+
+def _is_close_part(stored: bytes | Floats, made: bytes | Floats) -> bool:
+    if isinstance(stored, bytes) or isinstance(made, bytes):
+        is_picture = isinstance(stored, bytes) and isinstance(made, bytes)
+        return is_picture and (stored == made or _is_close_image(stored, made))  # type: ignore[arg-type]
+    if stored.shape != made.shape:
+        return False
+    return float(np.abs(stored - made).max()) <= GEOMETRY * max(1.0, float(np.abs(made).max()))
+
+
+def _read_glb(data: bytes) -> tuple[dict[str, object], list[bytes | Floats]]:
+    """Return the header of a binary glTF file without what depends on lengths, its pictures and its numbers."""
+    (length,) = struct.unpack_from("<12xI", data)
+    header, body = json.loads(data[20 : 20 + length]), data[28 + length :]
+    views = [body[view["byteOffset"] :][: view["byteLength"]] for view in header.pop("bufferViews")]
+    parts: list[bytes | Floats] = [views[image["bufferView"]] for image in header.pop("images", [])]
+    kinds = {5123: "<u2", 5125: "<u4", 5126: "<f4"}
+    for accessor in header["accessors"]:
+        parts.append(np.frombuffer(views[accessor.pop("bufferView")], kinds[accessor["componentType"]]))
+        for bound in ("min", "max"):
+            accessor.pop(bound, None)
+    header.pop("buffers")
+    return header, parts
 
 
 def _is_close_value(stored: object, made: object) -> bool:

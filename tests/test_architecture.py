@@ -541,7 +541,8 @@ def test_no_file_names_a_path_of_the_machine_it_was_written_on() -> None:
 
 
 def test_the_repository_stays_small() -> None:
-    assert sum(path.stat().st_size for path in repository_files()) < 30e6
+    """Half of it are the bundled places, which compress to a half."""
+    assert sum(path.stat().st_size for path in repository_files()) < 60e6
 
 
 def test_imports_inside_functions_are_few_and_say_why() -> None:

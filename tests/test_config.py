@@ -41,7 +41,10 @@ WRONG: dict[str, tuple[Any, str]] = {
     "path": ("", "expected approach, pass, orbit, a .csv file or a trajectory (TUM, EuRoC, KITTI), or two of them"),
     "shutter": (0.0, "expected a number greater than 0 and at most 60, got 0.0"),
     "rolling": (-61.0, "expected a number from -60 to 60, got -61.0"),
-    "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
+    "environment": (
+        [],
+        "expected the name of an environment, a .hdr or .exr file, the .yaml file of a place, or none, got ",
+    ),
     "up": ("x", "expected y or z, got x"),
     "size": (0, "expected a number of metres from 1e-4 to 1e4, got 0"),
     "things": (3, "expected a text such as 'car@12,3.5', a mapping or a list of these, got 3"),

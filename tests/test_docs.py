@@ -54,6 +54,7 @@ from advsearch.runs import export
 from advsearch.runs.exporters import EXPORTERS
 from advsearch.scene import library
 from advsearch.scene.importing.scenes import MITSUBA_FILE, split_node
+from advsearch.scene.places.place_file import is_place_file, read_place_file
 from advsearch.scene.rig import read_rig
 from advsearch.scene.settings import resolve
 from advsearch.settings import Config, parse_assignment, read_yaml
@@ -161,7 +162,8 @@ def check_names(config: Config) -> None:
         needs_label = not isinstance(config, (RenderConfig, HardenConfig)) and name not in library.list_objects()
         assert config.label is not None or not needs_label, "a file does not bring a label"
     for name in lights:
-        assert name in library.list_environments() or Path(name).suffix in library.SUFFIXES
+        is_file = Path(name).suffix in library.SUFFIXES or is_place_file(name)
+        assert name in library.list_environments() or is_file
     if isinstance(config, AttackConfig):
         as_controls(config.over)
         make_policy(config.policy_name, **config.policy_options)
@@ -244,6 +246,9 @@ def test_every_yaml_example_is_a_configuration(page: Path, tmp_path: Path) -> No
             continue
         if "cameras" in read_yaml(path):
             assert len(read_rig(str(path))) > 1
+            continue
+        if "mesh" in read_yaml(path):
+            assert read_place_file(path).lights
             continue
         if "parts" in read_yaml(path):
             read_recipe(str(path))

@@ -67,7 +67,12 @@ def _version(package: str) -> str:
         return "unknown"
 
 
-WITH_OTHERS = {".obj": (".mtl",), ".gltf": (".bin",), ".xml": (".obj", ".ply", ".serialized", ".exr", ".hdr")}
+WITH_OTHERS = {
+    ".obj": (".mtl",),
+    ".gltf": (".bin",),
+    ".xml": (".obj", ".ply", ".serialized", ".exr", ".hdr"),
+    **dict.fromkeys((".yaml", ".yml"), (".glb", ".gltf", ".bin", ".exr", ".hdr")),  # of a place
+}
 """Files that name others, and what these end in beside pictures."""
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff")

@@ -162,7 +162,8 @@ def load_scene(
 
     Args:
         object: a bundled name ("mug"), a path to a mesh (`advsearch.files.MESHES`), or an asset.
-        environment: a bundled name, a path to an .hdr or .exr file, an asset; default "studio".
+        environment: a bundled name, a path to an .hdr or .exr file or to the .yaml file of a place, an asset; default
+            "studio".
         scene: the file or, of Mitsuba, the dictionary (`mi.cornell_box()`) in which `object` is a node or the id of a
             shape; a file may as well be written before it: "scene.glb#chair", "box.xml#large-box".
         up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.

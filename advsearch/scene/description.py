@@ -25,6 +25,7 @@ from advsearch.scene.camera_model import CameraModel, bundled
 from advsearch.scene.formation import METERED_WHITE, WHITE, arriving, metered_gain
 from advsearch.scene.grounds import (
     Photograph,
+    find_place,
     has_lanes,
     is_against_traffic,
     on_its_ground,
@@ -47,7 +48,8 @@ from advsearch.scene.parts import (
     mesh_part,
     plugins_in,
 )
-from advsearch.scene.places.quads import FLOOR
+from advsearch.scene.places.environments import import_place
+from advsearch.scene.places.place_file import is_place_file
 from advsearch.scene.rig import Mount, read_rig
 from advsearch.scene.settings import ORBIT_CAMERA
 from advsearch.scene.things import ThingPart, ground_height, with_solids_checked, with_things
@@ -160,7 +162,9 @@ class SceneDescription:
         on_plane = self.number("ground.size") > 0.0 and self.photograph is None and not paved(self)
         on_table = on_plane and self.object.metres <= ON_TABLES
         if "camera.elevation" not in self.given:
-            own["camera.height"] = preset.height - (TABLE if on_table or FLOOR in self.around else 0.0)
+            place = find_place(self)
+            floor = -TABLE if on_table else 0.0 if place is None else place.file.floor
+            own["camera.height"] = preset.height + floor
         if preset.in_lane:
             own["camera.azimuth"] = 0.0
         if on_table:
@@ -413,6 +417,8 @@ def describe(
         values["ground.size"] = 0.0
     if isinstance(lit_by, EnvironmentAsset) or lit_by == NO_MAP:
         environment = lit_by if isinstance(lit_by, EnvironmentAsset) else None
+    elif is_place_file(lit_by):
+        environment = import_place(str(lit_by))
     elif is_path(lit_by):
         with reading(lit_by):
             environment = library.import_environment(Path(lit_by))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -15,12 +15,8 @@ from torch import Tensor
 from advsearch.scene import settings
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Mesh
 from advsearch.scene.geometry import camera_to_world, middle
-from advsearch.scene.library import BUNDLED_ENVIRONMENT
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.places.avenue import AVENUE, built
-from advsearch.scene.places.crossing import CAR_PARK, CROSSING
-from advsearch.scene.places.quads import EDGES, EYE, FRONTS, LAID, LENGTH, ROAD, STREET_ENDS, road
-from advsearch.scene.places.room import room
+from advsearch.scene.places.place_file import Place, lay_place, load_bundled_place
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -103,16 +99,17 @@ def irradiance(radiance: Tensor) -> Tensor:
 
 
 def paved(scene: SceneDescription) -> bool:
-    """Tell whether the object stands on the road, or in a room."""
-    return not scene.around.keys().isdisjoint(LAID)
+    """Tell whether the object stands on a road, or on the ground of a place."""
+    return any(part.is_ground for part in scene.around.values())
 
 
 def has_lanes(scene: SceneDescription) -> bool:
     """Tell whether the object stands in a lane, where what faces +x drives along it."""
-    return ROAD in scene.around and find_ground_kind(scene) != settings.CAR_PARK
+    place = find_place(scene)
+    return place is not None and place.file.lane_width is not None
 
 
-LANE_SIDE = 1.75  # metres from the middle of the object's lane to its side
+LANE_WIDTH = 3.5  # metres, of the lane that the object stands in where no place says it
 CAR_CAMERA = 2.5  # metres above the road up to which a camera in the lane may be that of a car
 
 
@@ -122,7 +119,9 @@ def is_against_traffic(scene: SceneDescription, camera: Doubles) -> bool:
         return False
     ahead, aside = (camera[:2, 3] - middle(scene)[:2]) * scene.metres
     height = float(camera[2, 3]) * scene.metres
-    return bool(ahead > 0.0 and abs(aside) <= LANE_SIDE and height <= CAR_CAMERA)
+    place = find_place(scene)
+    width = LANE_WIDTH if place is None or place.file.lane_width is None else place.file.lane_width
+    return bool(ahead > 0.0 and abs(aside) <= width / 2.0 and height <= CAR_CAMERA)
 
 
 def traffic_remark(scene: SceneDescription) -> str:
@@ -136,15 +135,21 @@ def traffic_remark(scene: SceneDescription) -> str:
 
 def enclosed(scene: SceneDescription) -> bool:
     """Tell whether so much stands around the object that light paths seldom leave the scene."""
-    return any(part.laid and part.name != ROAD for part in scene.around.values())
+    return any(part.laid and not part.is_ground for part in scene.around.values())
 
 
-PLACES: Mapping[str, Callable[..., tuple[MeshPart, ...]]] = {
-    settings.DRY_AVENUE: partial(built, AVENUE), settings.WET_AVENUE: partial(built, AVENUE),
-    settings.SNOW_AVENUE: partial(built, AVENUE, snow=True), settings.CROSSING: partial(built, CROSSING),
-    settings.CAR_PARK: partial(built, CAR_PARK), settings.ROOM: room, settings.LIT_ROOM: room,
-}  # fmt: skip
-"""What makes the meshes of each kind of ground that is a place."""
+PLACES: Mapping[str, tuple[str, str | None]] = {
+    settings.DRY_ROAD: ("road", None),
+    settings.WET_ROAD: ("road", "wet"),
+    settings.DRY_AVENUE: ("avenue", None),
+    settings.WET_AVENUE: ("avenue", "wet"),
+    settings.SNOW_AVENUE: ("avenue", "snow"),
+    settings.CROSSING: ("crossing", None),
+    settings.CAR_PARK: ("car-park", None),
+    settings.ROOM: ("room", None),
+    settings.LIT_ROOM: ("room", "evening"),
+}
+"""The bundled place, and its variant, of each kind of ground that is one."""
 
 
 def find_ground_kind(scene: SceneDescription) -> str | None:
@@ -159,20 +164,33 @@ def find_ground_kind(scene: SceneDescription) -> str | None:
     return scene.environment.ground
 
 
+def find_place(scene: SceneDescription) -> Place | None:
+    """Return the place that a scene has around its object; None where it has none."""
+    return next((part.place for part in scene.around.values() if part.place is not None), None)
+
+
+def load_requested_place(scene: SceneDescription) -> Place | None:
+    """Return the place that a scene's environment and its settings ask for; None where they ask for none."""
+    kind = find_ground_kind(scene)
+    if kind is not None:
+        return load_bundled_place(*PLACES[kind]) if kind in PLACES else None
+    light = scene.environment
+    is_described = scene.number("ground.size") <= 0.0 or not scene.given.isdisjoint(settings.TABLE_SETTINGS)
+    return None if light is None or is_described else light.place
+
+
 def on_its_ground(scene: SceneDescription) -> SceneDescription:
     """Return the scene with the road or the place that its environment and its settings ask for, and no other."""
-    kind = find_ground_kind(scene)
     others = tuple(part for part in scene.parts if not (isinstance(part, MeshPart) and part.laid))
-    if kind in settings.PLACES:
-        light, dark = scene.environment, kind == settings.LIT_ROOM
+    place = load_requested_place(scene)
+    if place is not None:
+        light = scene.environment
         unit = None if light is None else light.candelas
-        if light is not None and unit is not None and kind not in (settings.ROOM, settings.LIT_ROOM):
+        is_dark = False
+        if light is not None and unit is not None and place.file.lamps:
             arriving = irradiance(torch.from_numpy(light.radiance.copy()))
-            dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
-        place = PLACES[kind](scene.metres, unit, wet=kind == settings.WET_AVENUE, dark=dark)
-        return replace(scene, parts=(*others, *place))
-    if kind in settings.ROADS:
-        return replace(scene, parts=(*others, road(kind == settings.WET_ROAD, scene.metres)))
+            is_dark = unit * float(arriving @ torch.tensor(LUMINANCE)) < DUSK
+        return replace(scene, parts=(*others, *lay_place(place, scene.metres, unit, is_dark=is_dark)))
     return scene if len(others) == len(scene.parts) else replace(scene, parts=others)
 
 
@@ -245,14 +263,24 @@ def surroundings_of(scene: SceneDescription) -> Surroundings | None:
     lit = scene.environment
     if lit is None or scene.backdrop or enclosed(scene):  # what encloses the object is geometry, true from everywhere
         return None
-    laid: Box | float = (-LENGTH / 2.0, LENGTH / 2.0, *EDGES) if paved(scene) else math.inf
-    if lit.ground is not None and lit.source == BUNDLED_ENVIRONMENT and paved(scene):
-        stands = (-STREET_ENDS, STREET_ENDS, *FRONTS)
-        return Surroundings(EYE, stands, laid, scene.number("environment.rotation"))
+    place = find_place(scene)
+    laid: Box | float = math.inf if place is None else bound_ground(place)
+    bundled = PLACES.get(lit.ground or "")
+    shown = lit.place if bundled is None else load_bundled_place(*bundled)
+    if place is not None and shown is not None and shown.file.picture is not None:
+        picture = shown.file.picture
+        return Surroundings(picture.height, (*picture.x, *picture.y), laid, scene.number("environment.rotation"))
     if lit.photographed and (paved(scene) or scene.photograph is not None):
         height, radius = scene.capture_height * scene.metres, scene.values.get("ground.radius")
         return Surroundings(height, RADIUS * height if radius is None else radius, laid)
     return Surroundings(math.inf, math.inf, laid) if paved(scene) else None
+
+
+def bound_ground(place: Place) -> Box:
+    """Return from where to where the ground of a place reaches in x and in y, metres."""
+    vertices = np.concatenate([part.mesh.vertices for part in place.parts if part.is_ground])
+    (x0, y0), (x1, y1) = vertices[:, :2].min(axis=0).tolist(), vertices[:, :2].max(axis=0).tolist()
+    return x0, x1, y0, y1
 
 
 def view_of(scene: SceneDescription, to_world: Doubles | None = None, fov: float | None = None) -> CameraView:
@@ -280,9 +308,10 @@ def place_of(view: CameraView) -> Doubles:
 def past(scene: SceneDescription, views: Sequence[CameraView], *, turns: bool = False) -> tuple[str, ...]:
     """Return what is said where views of a scene, at least one, go past what its environment's picture is valid for;
     `turns`: that is turned from view to view."""
-    around = surroundings_of(scene)
-    if around is None:
-        return ()
+    around, place = surroundings_of(scene), find_place(scene)
+    outside = () if place is None else remark_outside(scene, place, views)
+    if outside or around is None:
+        return outside
     name, unit = scene.environment_name, "m" if scene.object.metres is not None else "object sizes"
     if valid(around, views[0]) == (0.0, 0.0) or (turns and isinstance(around.stands, tuple)):
         return (
@@ -304,4 +333,26 @@ def past(scene: SceneDescription, views: Sequence[CameraView], *, turns: bool = 
         f"{name}: the place around the object is a picture, which fits a camera up to {which} away{high}; {there} "
         f"{reach:.3g} {unit} away and {top:.3g} {unit} high. There what stands around is more than twice too large or "
         "too high, or the ground ends in sight: predictions from there are about the picture, not about a real place",
+    )
+
+
+def remark_outside(scene: SceneDescription, place: Place, views: Sequence[CameraView]) -> tuple[str, ...]:
+    """Return what is said where views of a scene, at least one, are outside of what its place holds for."""
+    bounds = [(axis, limits) for axis, limits in place.file.valid if limits is not None]
+    positions = np.array([place_of(view) for view in views])
+    is_outside = np.zeros(len(views), bool)
+    for axis, (low, high) in bounds:
+        along = positions[:, "xyz".index(axis)]
+        is_outside |= (along < low) | (along > high)
+    if not is_outside.any():
+        return ()
+    box = " and ".join(f"{axis} {low:g} to {high:g} m" for axis, (low, high) in bounds)
+    x, y, z = positions[int(is_outside.argmax())]
+    first = f"x {x:.3g}, y {y:.3g}, z {z:.3g} m"
+    which = f"the camera is outside, at {first}"
+    if len(views) > 1:
+        which = f"{100.0 * is_outside.mean():.0f} % of the views are outside, the first at {first}"
+    return (
+        f"{scene.environment_name}: the place holds for a camera at {box} from the object; {which}. Predictions from "
+        "there are not about a real place",
     )

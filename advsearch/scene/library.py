@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 BUNDLED_OBJECT = "bundled object"  # source of an object that is bundled, or another member of its family
 BUNDLED_ENVIRONMENT = "bundled environment"  # source of an environment that is bundled
-MAP_HINT = "A path to an .hdr or .exr file works too."
+MAP_HINT = "A path to an .hdr or .exr file, or to the .yaml file of a place, works too."
 OBJECT_HINT = f"A path to a file that ends in {either(MESHES)} works too."
 
 

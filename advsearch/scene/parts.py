@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
-from typing import ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from advsearch.scene.assets import normalised as normalised
 from advsearch.scene.rigged import PERSON as PERSON
 from advsearch.scene.rigged import TIME as TIME
 from advsearch.scene.rigged import part_of_a_rig as part_of_a_rig
+
+if TYPE_CHECKING:
+    from advsearch.scene.places.place_file import Place
 
 Triple = tuple[float, float, float]
 BASE_COLOR = "base color"  # the type that stands for the texture in a surface in Mitsuba's words
@@ -56,6 +59,13 @@ class Footprint(NamedTuple):
     high: float
 
 
+class Solid(NamedTuple):
+    """What nothing else can be in, and what it is called in a sentence: "a house"."""
+
+    name: str
+    footprint: Footprint
+
+
 @dataclass(frozen=True, eq=False)
 class MeshPart(Shape, ScenePart):
     """A shape in the scene; "object" is the object itself.
@@ -67,8 +77,14 @@ class MeshPart(Shape, ScenePart):
     """
 
     to_world: Doubles = field(default_factory=lambda: np.eye(4))  # (4, 4) its base pose
-    laid: bool = False  # it belongs to the ground that the scene has by itself, and goes with it
-    solids: tuple[Footprint, ...] = ()  # of what is laid: what nothing else can be in, in object sizes
+    place: Place | None = None  # which it belongs to, and goes with
+    is_ground: bool = False  # of a place: things stand on it
+    solids: tuple[Solid, ...] = ()  # of a place: what nothing else can be in, in object sizes
+
+    @property
+    def laid(self) -> bool:
+        """Whether it belongs to the ground that the scene has by itself."""
+        return self.place is not None
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,6 @@ from advsearch.scene.geometry import footprint, middle, overlapping, rotation, s
 from advsearch.scene.grounds import has_lanes
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.parts import Footprint, MeshPart, mesh_part
-from advsearch.scene.places.quads import LAID
 from advsearch.scene.settings import LAMPS
 
 if TYPE_CHECKING:
@@ -33,6 +32,7 @@ FARTHEST = 1000.0  # how far from the object a thing may stand, metres
 MOST = 64  # things beside an object
 EYE_SIZE = 1e-3  # half the width of what stands for a camera, object sizes
 OPTIONS = ("heading", "size", "name", "label", "lamps", "facing")
+LAID = ("road", "floor")  # what the ground of a bundled place is called
 ALL = "all"  # what stands for the object and every thing beside it
 TAKEN = ("object", "environment", "ground", "camera", *LAID, ALL)  # what a thing can't be called
 
@@ -157,8 +157,8 @@ def _pose(scene: SceneDescription, asset: ObjectAsset, asked: AskedThing, metres
 
 def ground_height(scene: SceneDescription, place: Doubles) -> float:
     """Return how high the ground lies at a place (2,), object sizes: road, pavement, table or floor; or 0."""
-    laid = (part for name, part in scene.around.items() if name in LAID)
-    triangles = (standing(part)[part.mesh.faces.astype(np.int64)] for part in laid)
+    ground = (part for part in scene.around.values() if part.is_ground)
+    triangles = (standing(part)[part.mesh.faces.astype(np.int64)] for part in ground)
     return max((height for corners in triangles for height in heights_over(corners, place)), default=0.0)
 
 
@@ -176,18 +176,12 @@ def heights_over(corners: Doubles, place: Doubles) -> list[float]:
     return heights
 
 
-SOLID_NAMES = {
-    "houses": "a house", "posts": "a lamp post", "trees": "the trunk of a tree", "sign-post": "the post of a sign",
-    "walls": "a wall", "furniture": "a piece of furniture", "lamp": "the ceiling",
-}  # fmt: skip
-"""What the solids of a place's meshes are called."""
-
-
 def solid_at(scene: SceneDescription, taken: Footprint) -> str | None:
     """Return which solid of the scene's place something overlaps with, such as "a house"; None where it stands free."""
-    for name, part in scene.around.items():
-        if any(overlapping(solid, taken) for solid in part.solids):
-            return SOLID_NAMES[name]
+    for part in scene.around.values():
+        for solid in part.solids:
+            if overlapping(solid.footprint, taken):
+                return solid.name
     return None
 
 

@@ -3,8 +3,8 @@
 The threat: a mesh, a scene, a layer or a summary may come from anywhere, so it may name anything on this machine, which
 would be read into a picture, a page or an export. Of all that a mesh names no more is read than one file may have.
 
-Used by the importers of meshes and scenes (`scene/importing/`, `scene/mitsuba_backend/xml_files.py`) and for pictures
-that a result names (`viewer/pages.py`).
+Used by the importers of meshes and scenes (`scene/importing/`, `scene/mitsuba_backend/xml_files.py`), for the mesh and
+the maps of a place (`scene/places/place_file.py`) and for pictures that a result names (`viewer/pages.py`).
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.scene.places.quads import EYE, FRONTS, WETNESS, reflectance
-from advsearch.scene.places.quads import STREET_ENDS as END
+from scenes.places.road import EYE, FRONTS, WETNESS, reflectance
+from scenes.places.road import STREET_ENDS as END
 
 from .panorama import Array, EnvironmentFamily
 

@@ -18,6 +18,7 @@ from advsearch.scene.assets import Mesh, ObjectAsset, normalised
 from scenes import build, files
 from scenes.environments import ENVIRONMENTS
 from scenes.environments.panorama import HEIGHT, LEVEL, brightness, directions, irradiance
+from scenes.places import PLACES, place_files
 
 SEEDS = (None, 1, 2, 3)  # None is the canonical instance
 CLASSES = {
@@ -241,6 +242,16 @@ def test_the_check_command_names_a_file_that_differs(
     assert capsys.readouterr().err.split() == [
         word for name in ("a/b.txt", "c.txt", "left-over") for word in ("differs:", f"advsearch/bundled/data/{name}")
     ]
+
+
+@pytest.mark.parametrize("name", ["road", "room"])
+def test_the_scripts_make_the_places_that_are_shipped(name: str) -> None:
+    for path, made in place_files(name, PLACES[name]()).items():
+        stored = (build.DATA / path).read_bytes()
+        assert build.is_close(path, stored, made), path
+        moved = stored.replace(b'roughnessFactor": 0', b'roughnessFactor": 1').replace(b"day:", b"sun:")
+        assert moved != stored and not build.is_close(path, moved, made), path
+        assert not build.is_close(path, stored[:-100], made), path
 
 
 def vertex_table(mesh: Mesh) -> np.ndarray:

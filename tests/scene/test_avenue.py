@@ -10,10 +10,11 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.grounds import LUMINANCE, enclosed, paved
-from advsearch.scene.places.avenue import AVENUE, END, KERB, LAMP_HEIGHT, lamp_places
-from advsearch.scene.places.paint import FRONTS
-from advsearch.scene.places.quads import KERBS, ROAD, SHOWN, Quads, Wall
 from advsearch.scene.things import ground_height
+from scenes.places.avenue import AVENUE, END, KERB, LAMP_HEIGHT, lamp_places
+from scenes.places.paint import FRONTS
+from scenes.places.quads import SHOWN, Quads, Wall
+from scenes.places.road import KERBS
 
 
 def laid(scene: SceneDescription) -> set[str]:
@@ -29,10 +30,10 @@ def test_kerbs_are_as_high_as_the_page_says() -> None:
 
 def test_an_avenue_comes_and_goes_with_its_ground() -> None:
     scene = load_scene("car", "avenue")
-    assert {ROAD, "houses", "trees", "posts"} <= laid(scene.description)
+    assert {"road", "houses", "trees", "posts"} <= laid(scene.description)
     assert paved(scene.description)
     assert enclosed(scene.description)
-    assert laid(scene.with_settings({"ground.kind": "road"}).description) == {ROAD}
+    assert laid(scene.with_settings({"ground.kind": "road"}).description) == {"road"}
     assert not laid(scene.with_settings({"ground.size": 0.0}).description)
     assert not enclosed(describe("car", "street"))
     assert enclosed(describe("mug", "noon", given={"ground.kind": "avenue"}))
@@ -42,11 +43,11 @@ def test_an_avenue_comes_and_goes_with_its_ground() -> None:
 def test_an_avenue_has_its_size_in_metres_whatever_stands_in_it(name: str) -> None:
     scene = describe(name, "avenue")
     places = {one: part.mesh.vertices * scene.metres for one, part in scene.around.items()}
-    assert np.ptp(places[ROAD][:, 0]) > 2 * END
+    assert np.ptp(places["road"][:, 0]) > 2 * END
     assert places["houses"][:, 2].max() < 25.0
     assert places["houses"][:, 2].min() == pytest.approx(KERB, abs=1e-4)
     assert places["posts"][:, 2].max() == pytest.approx(KERB + LAMP_HEIGHT, abs=0.15)
-    assert places[ROAD][:, 2].max() == pytest.approx(KERB, abs=1e-4)
+    assert places["road"][:, 2].max() == pytest.approx(KERB, abs=1e-4)
     inside = places["houses"][np.abs(places["houses"][:, 0]) < 100.0][:, 1]
     assert not ((inside > FRONTS[0] + 1.5) & (inside < FRONTS[1] - 1.5)).any(), "something of a house is in the street"
     lamps = lamp_places(AVENUE.posts)
@@ -72,7 +73,7 @@ def test_snow_lies_on_what_faces_up_and_on_nothing_else() -> None:
     names = ("houses", "trees", "posts")
     assert len(corners) == sum(len(dry[name].mesh.faces) - len(snow[name].mesh.faces) for name in names)
     assert all(np.array_equal(dry[name].mesh.vertices, snow[name].mesh.vertices) for name in ("windows", "shops"))
-    base = snow[ROAD].base_color
+    base = snow["road"].base_color
     rows = np.round((FRONTS[1] - np.array([-8.0, 1.75, 0.75])) / 0.03).astype(int)  # pavement, middle of road, wheels
     pavement, middle, track = (float(base[row - 1 : row + 2].mean()) for row in rows)
     assert pavement > 0.85 > middle > 0.6 > 0.45 > track
@@ -81,7 +82,7 @@ def test_snow_lies_on_what_faces_up_and_on_nothing_else() -> None:
 def test_boxes_at_a_wall_face_outwards() -> None:
     frame, quads = Wall((1.0, 2.0, 0.0), (-1.0, 0.0, 0.0)), Quads()
     quads.boxes(frame, np.array([[0.0, 2.0, 0.0, 0.5, 1.0, 1.3]]), np.array([[0.0, 1.0, 0.0, 1.0]]), SHOWN)
-    mesh = quads.mesh(1.0)
+    mesh = quads.mesh()
     middle = mesh.vertices.mean(axis=0)
     away = mesh.vertices[mesh.faces].mean(axis=1) - middle
     assert ((mesh.normals[mesh.faces[:, 0]] * away).sum(axis=1) > 0.0).all()

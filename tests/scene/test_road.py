@@ -14,8 +14,8 @@ from advsearch.errors import InputError
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.grounds import paved
-from advsearch.scene.places.quads import ROAD, reflectance
 from advsearch.scene.raster import texels_of_faces
+from scenes.places.road import reflectance
 
 SIZE = 16
 
@@ -40,7 +40,7 @@ def test_a_street_brings_its_road_and_a_table_takes_its_place() -> None:
 def test_another_environment_brings_its_own_ground() -> None:
     street, wet = (load_scene("car", name) for name in ("street", "street-wet"))
     lit = street.lit_by(wet.description.environment)
-    dry, damp = (one.description.around[ROAD] for one in (street, lit))
+    dry, damp = (one.description.around["road"] for one in (street, lit))
     assert damp.material.roughness < dry.material.roughness
     assert damp.base_color.mean() < dry.base_color.mean()
     assert not paved(street.lit_by(load_scene("mug", "noon").description.environment).description)
@@ -48,7 +48,7 @@ def test_another_environment_brings_its_own_ground() -> None:
 
 def test_a_road_has_its_size_in_metres_whatever_stands_on_it() -> None:
     car, sign = (load_scene(name, "street").description for name in ("car", "stop-sign"))
-    extents = [np.ptp(one.around[ROAD].mesh.vertices, axis=0) * one.metres for one in (car, sign)]
+    extents = [np.ptp(one.around["road"].mesh.vertices, axis=0) * one.metres for one in (car, sign)]
     np.testing.assert_allclose(extents[0], extents[1], rtol=1e-5)
     assert extents[0][0] == pytest.approx(120.0)
     lane, line, pavement = reflectance(np.array([4.0, 1.0, 0.3]), np.array([0.0, 1.75, -4.2]))

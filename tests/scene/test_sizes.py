@@ -22,7 +22,6 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.glb import glb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import import_scene
-from advsearch.scene.places.quads import ROAD
 
 
 def box(folder: Path, name: str, longest: float) -> Path:
@@ -65,7 +64,7 @@ def test_a_car_stands_in_its_lane_at_its_size(tmp_path: Path, longest: float, sa
     scene = load_scene(str(box(tmp_path, "sedan", longest)), "street", up="z", **said)  # type: ignore[arg-type]
     own = scene.description
     assert own.metres == pytest.approx(4.9, rel=1e-5)
-    road = own.around[ROAD].mesh.vertices
+    road = own.around["road"].mesh.vertices
     assert np.ptp(road[:, 0]) * own.metres == pytest.approx(120.0)
     assert np.ptp(own.base_vertices, axis=0) / np.ptp(road, axis=0)[0] * 120.0 == pytest.approx(
         [4.9, 1.96, 1.47], rel=1e-4

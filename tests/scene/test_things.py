@@ -113,13 +113,16 @@ def test_solids_of_a_place_are_where_its_meshes_are(kind: str) -> None:
     """Each post, trunk and house has some of its mesh's vertices at its outline, and the object stands free."""
     scene = describe("car", "overcast", given={"ground.kind": kind})
     assert not scene.remarks
-    for part in scene.around.values():
-        vertices = standing(part)
-        for solid in part.solids:
-            low = solid.outline.min(axis=0) - 0.05
-            high = solid.outline.max(axis=0) + 0.05
-            near = ((vertices[:, :2] >= low) & (vertices[:, :2] <= high)).all(axis=1)
-            assert near.any() and vertices[near, 2].max() >= solid.high - 0.1, part.name
+    meshes = {"a house": "houses", "the trunk of a tree": "trees", "a lamp post": "posts"}
+    meshes["the post of a sign"] = "sign-post"
+    solids = [solid for part in scene.around.values() for solid in part.solids]
+    assert {"a house", "the trunk of a tree", "a lamp post"} <= {name for name, _ in solids}
+    for name, solid in solids:
+        vertices = standing(scene.around[meshes[name]])
+        low = solid.outline.min(axis=0) - 0.05
+        high = solid.outline.max(axis=0) + 0.05
+        near = ((vertices[:, :2] >= low) & (vertices[:, :2] <= high)).all(axis=1)
+        assert near.any() and vertices[near, 2].max() >= solid.high - 0.1, name
 
 
 def test_a_room_has_walls_and_shelves_that_nothing_stands_in() -> None:

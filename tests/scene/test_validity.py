@@ -14,7 +14,7 @@ from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.grounds import CameraView, Surroundings, past, surroundings_of, valid, view_of
 from advsearch.scene.library import load_environment, load_object
-from advsearch.scene.places.quads import EDGES, EYE, LENGTH
+from scenes.places.road import EDGES, EYE, LENGTH
 
 SIDE = 96
 FAR_SIDE = 90.0

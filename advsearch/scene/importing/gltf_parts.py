@@ -178,11 +178,13 @@ class GltfSurfaces:
 
     file: GltfFile
     notes: Notes
+    texture_limit: int | None = None  # longest side of a texture; None for what `FilePictures` takes for an object
 
     def __post_init__(self) -> None:
-        self._pictures = FilePictures(len(self.file.header.materials), self.file.references, self.notes)
+        materials = len(self.file.header.materials)
+        self._pictures = FilePictures(materials, self.file.references, self.notes, self.texture_limit)
 
-    def surface(self, number: int | None, pieces: Sequence[_Piece]) -> tuple[ImportedSurface, Doubles, Doubles]:
+    def surface(self, number: int | None, pieces: Sequence[Piece]) -> tuple[ImportedSurface, Doubles, Doubles]:
         """Return the surface of a material (None: the format's default), and by what texture coordinates are scaled,
         (2,), and shifted then, (2,), to fit its pictures; `pieces` are all that have it, with the format's."""
         material = MaterialEntry() if number is None else self.file.header.materials[number]
@@ -219,7 +221,7 @@ class GltfSurfaces:
         surface = ImportedSurface(kept, texture, unit(roughness), unit(metallic), normals, emission, name)
         return self._fitted(surface, material, [piece.part.uvs for piece in pieces if piece.part.uvs is not None])
 
-    def _roughness_and_metallic(self, material: MaterialEntry, pieces: Sequence[_Piece]) -> tuple[float, float]:
+    def _roughness_and_metallic(self, material: MaterialEntry, pieces: Sequence[Piece]) -> tuple[float, float]:
         """The factors times the mean of their picture over the faces that show it; over all of it where they have no
         coordinates."""
         entry, use = material.surface, material.surface.metallicRoughnessTexture
@@ -348,7 +350,7 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     moving = gltf_skeleton.check_moving(file, [node for node, _, _ in drawn])
     skinned = {mesh for node, mesh, _ in drawn if header.nodes[node].skin is not None}
     pieces = {
-        (mesh, number): _piece(file, primitive, header.meshes[mesh].extras, mesh in skinned)
+        (mesh, number): read_piece(file, primitive, header.meshes[mesh].extras, mesh in skinned)
         for mesh in dict.fromkeys(mesh for _, mesh, _ in drawn)
         for number, primitive in enumerate(header.meshes[mesh].primitives)
     }
@@ -368,7 +370,7 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     for sentence in _counts({SEE_THROUGH: [True] * len(clear), DEFAULT: [True] * len(bare)}):
         notes.say(sentence)
     surfaces, finished = GltfSurfaces(file, notes), dict[tuple[int, int], ImportedPart]()
-    groups = dict[int | None, dict[tuple[int, int], _Piece]]()
+    groups = dict[int | None, dict[tuple[int, int], Piece]]()
     for key, piece in with_faces.items():
         groups.setdefault(piece.material, {})[key] = piece
     for material, group in groups.items():
@@ -412,7 +414,7 @@ def read_gltf(path: Path, data: bytes, notes: Notes) -> list[ImportedPart]:
     return parts
 
 
-class _Piece(NamedTuple):
+class Piece(NamedTuple):
     """A primitive as it is stored, without surface. Texture coordinates are the format's, v = 0 at the top."""
 
     part: ImportedPart  # its geometry
@@ -424,7 +426,7 @@ class _Piece(NamedTuple):
     packed_uvs: Doubles | None  # (V, 2) of its texture of roughness and metallic
 
 
-def _piece(file: GltfFile, primitive: Primitive, extras: object, skinned: bool) -> _Piece | None:
+def read_piece(file: GltfFile, primitive: Primitive, extras: object, skinned: bool) -> Piece | None:
     """Return a primitive; None for points, lines and what has no places. `extras` are those of its mesh."""
     held, header = primitive.attributes, file.header
     if primitive.mode < TRIANGLES or "POSITION" not in held:
@@ -451,7 +453,7 @@ def _piece(file: GltfFile, primitive: Primitive, extras: object, skinned: bool) 
     part = ImportedPart(vertices, faces, normals, uvs, colors, ImportedSurface(), flat=True)
     joints = gltf_skeleton.bound(file, primitive, used) if skinned else None
     targets = gltf_skeleton.targets_of(file, primitive, used, extras)
-    return _Piece(part, primitive.material, see_through, joints, *targets, packed_uvs)
+    return Piece(part, primitive.material, see_through, joints, *targets, packed_uvs)
 
 
 def _coordinates(file: GltfFile, held: Mapping[str, int], use: TextureUse | None, used: Ints) -> Doubles | None:

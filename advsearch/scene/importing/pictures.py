@@ -136,12 +136,15 @@ class FilePictures:
     materials: int  # how many the file has
     references: References  # finds the files that it names
     notes: Notes  # about the file: which pictures were made smaller, and which cannot be had, and why
+    limit: int | None = None  # longest side of a texture, whatever the number of materials; None for an object's
     _known: dict[tuple[Hashable, Kind], Floats | str] = field(default_factory=dict)
     _pixels: Counter[bool] = field(default_factory=Counter)
 
     @property
     def side(self) -> int:
         """The longest side of the textures of so many materials; all together they take a bounded memory."""
+        if self.limit is not None:
+            return self.limit
         side = TEXTURE_LIMIT
         while side > 64 and self.materials * side * side > MOST_TEXTURES * TEXTURE_LIMIT * TEXTURE_LIMIT:
             side //= 2

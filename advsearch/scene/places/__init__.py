@@ -1,1 +1,1 @@
-"""Places as geometry, made by script when a scene needs them: true to scale, to be seen from near and from afar."""
+"""Places as geometry around the object: a glTF file and a YAML file that says what its meshes are."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from advsearch.scene.assets import Bools, Doubles
-from advsearch.scene.places import paint
-from advsearch.scene.places.quads import FRONT, SHOWN, SIDES, TOP, Quads, Wall
+from scenes.places import paint
+from scenes.places.quads import FRONT, SHOWN, SIDES, TOP, Quads, Wall
 
 DEPTH = 11.0
 REVEAL, SHOP_REVEAL = 0.17, 0.32  # how far windows stand back

@@ -6,15 +6,16 @@ painted with what is outside and shines, and in the evening from the lamp on the
 
 from __future__ import annotations
 
-from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from advsearch.scene.assets import Doubles, Floats, Material
-from advsearch.scene.parts import Footprint, MeshPart
-from advsearch.scene.places.paint import _clouds, _grain, tint
-from advsearch.scene.places.quads import FLOOR, FRONT, SHOWN, Quads, Wall, shown
+from scenes.places.models import Look, Node, PlaceModel, make_primitive
+from scenes.places.paint import _clouds, _grain, tint
+from scenes.places.quads import FRONT, SHOWN, Quads, Wall
+from scenes.places.road import shown
 
 LOW, HIGH = (-1.75, -2.0, -0.75), (2.6, 1.9, 1.85)  # corners of the room
 TABLE, THICK = ((-0.45, 0.45), (-0.8, 0.8)), 0.035  # from and to in x and y of its top, which is at height 0
@@ -23,7 +24,6 @@ CASE, BOARDS = ((-1.75, -1.46), (-1.5, 1.1)), (-0.69, -0.33, 0.03, 0.39, 0.75, 1
 WINDOW = ((-0.9, 1.5), (0.12, 1.5))  # from and to in x and z, in the wall at the largest y
 REVEAL, LAMP = 0.16, 0.24  # how far the pane stands back, and half a side of the lamp
 DAY, NIGHT, SHADE = 2600.0, 0.6, 4200.0  # luminance of the window's sky by day and by night, and of the lamp, cd/m2
-USUAL = 1000.0  # luminance of a radiance of 1, cd/m2, where the light has no unit
 STRIP, TEXEL, COLUMNS = 0.5, 0.0125, 96
 """How high each strip of the texture is, how large a texel, and how many there are along a strip of 1.2 m."""
 OUTSIDE = 1000.0  # how far what lies behind a wall reaches
@@ -38,36 +38,45 @@ BOOKS = tuple(range(5, len(COLORS)))
 MATT, VARNISH = Material(roughness=0.8, specular=0.3), Material(roughness=0.35, specular=0.45)
 
 
-@lru_cache(maxsize=4)
-def room(metres: float, candelas: float | None, *, wet: bool, dark: bool) -> tuple[MeshPart, ...]:
-    """Return the meshes of the room; arguments as of `avenue.built`. It is never wet."""
-    unit, texture = np.float32(candelas or USUAL), _texture()
-    lamp = np.array((1.0, 0.82, 0.56), np.float32) * np.float32(SHADE if dark else 0.0) / unit
-    outside = _outside() * np.float32(NIGHT if dark else DAY) / unit
-    black, white = np.full((2, 2, 3), 0.02, np.float32), np.full((2, 2, 3), 0.8, np.float32)
+def make_room() -> PlaceModel:
+    """Return the room by day, with the evening as a variant."""
+    texture, outside = _texture(), _outside()
+    black, white = np.full(3, 0.02, np.float32), np.full(3, 0.8, np.float32)
+    lamp = np.array((1.0, 0.82, 0.56), np.float32) * np.float32(SHADE)
     ground, pane, ceiling = Quads(), Quads(), Quads()
     _flat(ground, (LOW[0], HIGH[0]), (LOW[1], HIGH[1]), LOW[2], PLANKS)
     _flat(ground, *TABLE, 0.0, OAK)
     wall = Wall((0.0, HIGH[1] + REVEAL, 0.0), (0.0, -1.0, 0.0))
     pane.wall(wall, np.array([[*WINDOW[0], *WINDOW[1]]]), 0.0, np.array([[0.0, 1.0, 0.0, 1.0]]))
     _flat(ceiling, (0.3 - LAMP, 0.3 + LAMP), (-LAMP, LAMP), HIGH[2] - 0.06, WHITE, -1)
-    made = (
-        (FLOOR, ground, texture, VARNISH, None),
-        ("walls", _walls(), texture, MATT, None),
-        ("furniture", _furniture(), texture, VARNISH, None),
-        ("books", _books(), texture, MATT, None),
-        ("window", pane, black, VARNISH, outside),
-        ("lamp", ceiling, white, MATT, lamp[None, None] if dark else None),
-    )
-    solids = {
-        "walls": _solid_walls(metres),
-        "furniture": _solid_furniture(metres),
-        "lamp": _solid_ceiling(metres),
+    looks = {
+        "floor": Look(texture, VARNISH),
+        "walls": Look(texture, MATT),
+        "furniture": Look(texture, VARNISH),
+        "books": Look(texture, MATT),
+        "window": Look(black, VARNISH, outside * np.float32(DAY)),
+        "dark-window": Look(black, VARNISH, outside * np.float32(NIGHT)),
+        "lamp": Look(white, MATT),
+        "lit-lamp": Look(white, MATT, lamp),
     }
-    return tuple(
-        MeshPart(name, quads.mesh(metres), base, finish, emission=shine, laid=True, solids=solids.get(name, ()))
-        for name, quads, base, finish, shine in made
+    nodes = (
+        Node([make_primitive(ground, "floor")]),
+        Node([make_primitive(_walls(), "walls")]),
+        Node([make_primitive(_furniture(), "furniture")]),
+        Node([make_primitive(_books(), "books")]),
+        Node([make_primitive(pane, "window", evening="dark-window")]),
+        Node([make_primitive(ceiling, "lamp", evening="lit-lamp")]),
     )
+    file = {
+        "ground": ["floor"],
+        "floor": LOW[2],
+        "lights": {
+            "day": {"map": "room", "lux": 200.0},
+            "evening": {"map": "room-evening", "lux": 120.0, "variant": "evening"},
+        },
+        "solids": [*_solid_walls(), *_solid_furniture(), _solid_ceiling()],
+    }
+    return PlaceModel(looks, nodes, file)
 
 
 def _texture() -> Floats:
@@ -102,32 +111,34 @@ def _outside() -> Floats:
     return np.asarray(np.where((v < trees)[..., None], green, sky), np.float32)
 
 
-def _solid_box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], metres: float) -> Footprint:
-    outline = np.array([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])])
-    return Footprint(outline / metres, z[0] / metres, z[1] / metres)
+def _solid_box(
+    name: str, x: tuple[float, float], y: tuple[float, float], heights: tuple[float, float]
+) -> dict[str, Any]:
+    outline = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
+    return {"name": name, "outline": [list(corner) for corner in outline], "heights": list(heights)}
 
 
-def _solid_walls(metres: float) -> tuple[Footprint, ...]:
-    """Return what lies behind the four walls, in units of `metres`."""
+def _solid_walls() -> list[dict[str, Any]]:
+    """Return what lies behind the four walls."""
     (x0, y0, _), (x1, y1, _) = LOW, HIGH
     heights = (LOW[2], HIGH[2])
     wide = (x0 - OUTSIDE, x1 + OUTSIDE)
     deep = (y0 - OUTSIDE, y1 + OUTSIDE)
     sides = (((wide[0], x0), deep), ((x1, wide[1]), deep), (wide, (deep[0], y0)), (wide, (y1, deep[1])))
-    return tuple(_solid_box(x, y, heights, metres) for x, y in sides)
+    return [_solid_box("a wall", x, y, heights) for x, y in sides]
 
 
-def _solid_ceiling(metres: float) -> tuple[Footprint, ...]:
-    """Return what lies above the ceiling, where its lamp hangs, in units of `metres`."""
+def _solid_ceiling() -> dict[str, Any]:
+    """Return what lies above the ceiling, where its lamp hangs."""
     wide = (LOW[0] - OUTSIDE, HIGH[0] + OUTSIDE)
     deep = (LOW[1] - OUTSIDE, HIGH[1] + OUTSIDE)
-    return (_solid_box(wide, deep, (HIGH[2], HIGH[2] + OUTSIDE), metres),)
+    return _solid_box("the ceiling", wide, deep, (HIGH[2], HIGH[2] + OUTSIDE))
 
 
-def _solid_furniture(metres: float) -> tuple[Footprint, ...]:
-    """Return what shelves and table top take up, in units of `metres`."""
-    shelves = _solid_box(*CASE, (LOW[2], BOARDS[-1]), metres)
-    return shelves, _solid_box(*TABLE, (-THICK, -0.001), metres)
+def _solid_furniture() -> list[dict[str, Any]]:
+    """Return what shelves and table top take up."""
+    name = "a piece of furniture"
+    return [_solid_box(name, *CASE, (LOW[2], BOARDS[-1])), _solid_box(name, *TABLE, (-THICK, -0.001))]
 
 
 def _rows(strip: int, low: Doubles | float, high: Doubles | float) -> tuple[Doubles, Doubles]:

@@ -7,19 +7,20 @@ where is a `StreetPlan`; `crossing.py` is made of the same parts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from advsearch.scene.assets import Doubles, Floats, Material
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.parts import Footprint, MeshPart
-from advsearch.scene.places import paint
-from advsearch.scene.places.houses import DEPTH, Fronts
-from advsearch.scene.places.quads import DRY, FRONT, KERBS, ROAD, SHOWN, WET, Quads, Wall, shown
+from scenes.places import paint
+from scenes.places.houses import DEPTH, Fronts
+from scenes.places.models import Look, Node, PlaceModel, Primitive, make_primitive
+from scenes.places.quads import FRONT, SHOWN, Quads, Wall
+from scenes.places.road import DRY, KERBS, WET, shown
 
 END, CROSSING, FAR = 150.0, 12.0, 4000.0  # where the street ends, how wide what it meets is, how far the plain goes
 KERB = 0.12
@@ -35,10 +36,10 @@ WALL, PANE, LEAF, IRON = (
     Material(roughness=0.7, specular=0.25), Material(roughness=0.45, specular=0.5),
 )  # fmt: skip
 WET_WALL = Material(roughness=0.5, specular=0.4)
-LIT = {  # luminance by night, cd/m2: a lamp puts 15 lux on the road below it (7.5 m, 0.36 x 0.22 m)
-    "street-lamps": np.array((10650.0 * 1.16, 10650.0 * 0.98, 10650.0 * 0.73), np.float32),
-    "lit-windows": np.array((36.0, 23.5, 10.0), np.float32),
-    "shops": np.array((62.0, 48.0, 31.0), np.float32),
+LAMPS = {  # luminance by night, cd/m2: a lamp puts 15 lux on the road below it (7.5 m, 0.36 x 0.22 m)
+    "street-lamps": (10650.0 * 1.16, 10650.0 * 0.98, 10650.0 * 0.73),
+    "lit-windows": (36.0, 23.5, 10.0),
+    "shops": (62.0, 48.0, 31.0),
 }
 
 
@@ -51,89 +52,122 @@ class Tree(NamedTuple):
     side: int = 0
 
 
-class StreetPlan(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class StreetPlan:
     """What stands where."""
 
     ground: Callable[[], Quads]  # makes road and pavements
     fronts: tuple[tuple[Wall, float, float, int], ...]  # of houses: walls, from where to where along them, seeds
     trees: tuple[Tree, ...]
     posts: tuple[tuple[float, float, float], ...]  # (x, y) of the foot of each lamp post, and y of its lamp
-    # makes further meshes, from the metres of one object size
-    more: Callable[[float], tuple[MeshPart, ...]] = lambda metres: ()
+    lights: Mapping[str, Mapping[str, Any]]  # as its YAML file has them
+    more: Mapping[str, Any] = field(default_factory=dict)  # further entries of that file
+    looks: Mapping[str, Look] = field(default_factory=dict)  # further materials
+    nodes: tuple[Node, ...] = ()  # and what has them
+    solids: tuple[Mapping[str, Any], ...] = ()
+    has_weather: bool = False  # whether it may be wet, or lie in snow
 
 
-@lru_cache(maxsize=4)
-def built(
-    plan: StreetPlan, metres: float, candelas: float | None, *, wet: bool, dark: bool, snow: bool = False
-) -> tuple[MeshPart, ...]:
-    """Return the meshes of a place, with lengths in the metres of one object size.
-
-    Args:
-        candelas: luminance of a radiance of 1, cd/m2; None where the light has no unit.
-        wet: whether the road is dark and reflects.
-        dark: whether lamps and windows shine.
-        snow: whether snow lies on all that faces up; on the road it is driven on.
-    """
-    rows, ground = _houses(plan.fronts), WET if wet else DRY
-    grey, white = np.full((2, 2, 3), 0.25, np.float32), np.full((2, 2, 3), 0.9, np.float32)
-    tone = 1.0 + 0.25 * paint._clouds(128, 128, 32, 400) + 0.2 * paint._grain(128, 128, 401)
-    grass = linear_to_srgb(np.clip(paint.tint((0.075, 0.095, 0.045)) * tone[..., None], 0.0, 1.0))
-    fallen, plain = Quads(), Quads()
+def make_street(plan: StreetPlan) -> PlaceModel:
+    """Return a street with all that stands in it."""
+    rows = _houses(plan.fronts)
+    iron, lamps = _posts(plan.posts)
+    plain = Quads()
     corners = FAR * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     plain.level((-FAR, FAR), (-FAR, FAR), -0.05, corners / 50.0)
-    iron, lamps = _posts(plan.posts)
-    walls, trees, posts = (quads.swept(fallen) if snow else quads for quads in (rows.walls, _trees(plan.trees), iron))
-    made = (
-        (ROAD, plan.ground(), _display(paint.road, wet, snow), ground),
-        ("houses", walls, _display(paint.walls), WET_WALL if wet else WALL),
-        ("windows", rows.dark, _display(paint.panes), PANE),
-        ("lit-windows", rows.lit, _display(paint.panes), PANE),
-        ("shops", rows.shops, _display(paint.panes), PANE),
-        ("trees", trees, _leaves(), LEAF),
-        ("posts", posts, grey, IRON),
-        ("street-lamps", lamps, white, PANE),
-        ("plain", plain, white if snow else grass, WALL),
-        *((("snow", fallen, white, WALL),) if snow else ()),
-    )
-    shine = {name: cd[None, None] / np.float32(candelas) for name, cd in LIT.items()} if dark and candelas else {}
-    solids = {
-        "houses": tuple(house_row(row, metres) for row in plan.fronts),
-        "trees": tuple(column(tree.x, tree.y, TRUNK, KERB + TRUNK_HEIGHT, metres) for tree in plan.trees),
-        "posts": tuple(column(x, y, POST, KERB + LAMP_HEIGHT, metres) for x, y, _ in plan.posts),
+    weather = plan.has_weather
+    roads = {"wet": "wet-road", "snow": "snowy-road"} if weather else {}
+    plains = {"snow": "snowy-plain"} if weather else {}
+    walls = {"wet": "wet-houses"} if weather else {}
+    nodes = [
+        Node([make_primitive(plan.ground(), "road", **roads)]),
+        Node(_swept(rows.walls, "houses", weather, **walls)),
+        Node([make_primitive(rows.dark, "windows")]),
+        Node([make_primitive(rows.lit, "lit-windows")]),
+        Node([make_primitive(rows.shops, "shops")]),
+        *_tree_nodes(plan.trees, weather),
+        Node(_swept(iron, "posts", weather)),
+        Node([make_primitive(lamps, "street-lamps")]),
+        Node([make_primitive(plain, "plain", **plains)]),
+        *plan.nodes,
+    ]
+    used = {look for node in nodes for one in node.primitives for look in (one.look, *one.variants.values())}
+    looks = {name: look for name, look in {**_make_looks(), **plan.looks}.items() if name in used}
+    file = {
+        "ground": ["road"],
+        "lamps": {name: list(luminance) for name, luminance in LAMPS.items()},
+        **plan.more,
+        "lights": {name: dict(light) for name, light in plan.lights.items()},
+        "solids": [*_list_solids(plan), *map(dict, plan.solids)],
     }
-    meshes = (
-        MeshPart(
-            name, quads.mesh(metres), base, finish,
-            emission=shine.get(name), laid=True, solids=solids.get(name, ()),
-        )
-        for name, quads, base, finish in made
-    )  # fmt: skip
-    return (*meshes, *plan.more(metres))
+    return PlaceModel(looks, nodes, file)
 
 
-def house_row(row: tuple[Wall, float, float, int], metres: float) -> Footprint:
-    """Return what a row of houses takes up, as high as the lowest house, in units of `metres`."""
-    frame, begin, end, _ = row
-    along = np.array([begin, end, end, begin])
-    out = np.array([0.0, 0.0, -DEPTH, -DEPTH])
-    outline = frame.world(along, out, np.zeros(4))[:, :2]
-    height = paint.GROUND_FLOOR + 2.0 * paint.FLOOR
-    return Footprint(outline / metres, 0.0, height / metres)
+def _make_looks() -> dict[str, Look]:
+    tone = 1.0 + 0.25 * paint._clouds(128, 128, 32, 400) + 0.2 * paint._grain(128, 128, 401)
+    grass = linear_to_srgb(np.clip(paint.tint((0.075, 0.095, 0.045)) * tone[..., None], 0.0, 1.0))
+    walls, panes = shown(paint.walls()), shown(paint.panes())
+    white = np.full(3, 0.9, np.float32)
+    return {
+        "road": Look(shown(paint.road(False)), DRY),
+        "wet-road": Look(shown(paint.road(True)), WET),
+        "snowy-road": Look(shown(paint.road(False, True)), DRY),
+        "houses": Look(walls, WALL),
+        "wet-houses": Look(walls, WET_WALL),
+        "windows": Look(panes, PANE),
+        "lit-windows": Look(panes, PANE),
+        "shops": Look(panes, PANE),
+        "trees": Look(_leaves(), LEAF),
+        "posts": Look(np.full(3, 0.25, np.float32), IRON),
+        "street-lamps": Look(white, PANE),
+        "plain": Look(grass, WALL),
+        "snowy-plain": Look(white, WALL),
+        "snow": Look(white, WALL),
+    }
 
 
-def column(x: float, y: float, radius: float, top: float, metres: float) -> Footprint:
-    """Return what something round takes up, from the ground to its top, in units of `metres`."""
-    turn = np.arange(8) * (np.pi / 4.0)
-    outline = np.array([x, y]) + radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return Footprint(outline / metres, 0.0, top / metres)
+def _swept(quads: Quads, look: str, has_snow: bool, **variants: str) -> list[Primitive]:
+    """Return what does not face up, and what does, which snow may lie on."""
+    if not has_snow:
+        return [make_primitive(quads, look, **variants)]
+    fallen = Quads()
+    bare = quads.swept(fallen)
+    return [make_primitive(bare, look, **variants), make_primitive(fallen, look, **variants, snow="snow")]
 
 
-@lru_cache(maxsize=8)
-def _display(texture: Callable[..., Floats], *arguments: bool) -> Floats:
-    return shown(texture(*arguments))
+def _tree_nodes(trees: tuple[Tree, ...], has_snow: bool) -> list[Node]:
+    kinds = [_swept(_tree(seed), "trees", has_snow) for seed in range(3)]
+    nodes = []
+    for x, y, number, side in trees:
+        turn, size = 2.4 * number + side, 0.9 + 0.2 * ((5 * number + 3 * side) % 7) / 7.0
+        pose = np.eye(4)
+        pose[:2, :2] = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        pose[:3, :3] *= size
+        pose[:3, 3] = x, y, KERB
+        nodes.append(Node(kinds[(number + side) % len(kinds)], pose))
+    return nodes
 
 
-@lru_cache(maxsize=2)
+def _list_solids(plan: StreetPlan) -> list[dict[str, Any]]:
+    top = paint.GROUND_FLOOR + 2.0 * paint.FLOOR  # of the lowest house
+    houses = []
+    for frame, begin, end, _ in plan.fronts:
+        along = np.array([begin, end, end, begin])
+        out = np.array([0.0, 0.0, -DEPTH, -DEPTH])
+        outline = frame.world(along, out, np.zeros(4))[:, :2]
+        houses.append({"name": "a house", "outline": outline.tolist(), "heights": [0.0, top]})
+    return [
+        *houses,
+        round_solid("the trunk of a tree", [(tree.x, tree.y) for tree in plan.trees], TRUNK, KERB + TRUNK_HEIGHT),
+        round_solid("a lamp post", [(x, y) for x, y, _ in plan.posts], POST, KERB + LAMP_HEIGHT),
+    ]
+
+
+def round_solid(name: str, positions: Sequence[tuple[float, float]], radius: float, top: float) -> dict[str, Any]:
+    """Return what something round takes up from the ground to its top, as the YAML file has it."""
+    return {"name": name, "at": [list(map(float, at)) for at in positions], "radius": radius, "heights": [0.0, top]}
+
+
 def _houses(fronts: tuple[tuple[Wall, float, float, int], ...]) -> Fronts:
     row = Fronts()
     for frame, begin, end, seed in fronts:
@@ -200,19 +234,6 @@ def _ground() -> Quads:
     quads = Quads()
     street(quads, -END, END)
     closed(quads)
-    return quads
-
-
-@lru_cache(maxsize=2)
-def _trees(places: tuple[Tree, ...]) -> Quads:
-    quads = Quads()
-    trees = [_tree(seed) for seed in range(3)]
-    for x, y, number, side in places:
-        kind = trees[(number + side) % len(trees)]
-        turn, size = 2.4 * number + side, 0.9 + 0.2 * ((5 * number + 3 * side) % 7) / 7.0
-        matrix = size * np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0, 0, 1.0]])
-        for corners, uvs, normals in zip(kind.corners, kind.uvs, kind.normals, strict=True):
-            quads.add(corners @ matrix.T + [x, y, KERB], uvs, normals @ (matrix / size).T)
     return quads
 
 
@@ -321,4 +342,18 @@ def ends() -> tuple[tuple[Wall, float, float, int], ...]:
 RIGHT, LEFT = (  # walls on either side of a street along x; along the right one x falls
     Wall((0.0, paint.FRONTS[0], KERB), (0.0, 1.0, 0.0)), Wall((0.0, paint.FRONTS[1], KERB), (0.0, -1.0, 0.0)),
 )  # fmt: skip
-AVENUE = StreetPlan(_ground, ((RIGHT, -END, END, 1), (LEFT, -END, END, 2), *ends()), trees_along(), posts_along())
+AVENUE = StreetPlan(
+    _ground,
+    ((RIGHT, -END, END, 1), (LEFT, -END, END, 2), *ends()),
+    trees_along(),
+    posts_along(),
+    {
+        "day": {"map": "avenue", "lux": 75000.0},
+        "wet": {"map": "avenue-wet", "lux": 9000.0, "variant": "wet"},
+        "snow": {"map": "avenue-wet", "lux": 9000.0, "variant": "snow"},
+        "dusk": {"map": "avenue-dusk", "lux": 12.0},
+        "night": {"map": "avenue-night", "lux": 0.3},
+    },
+    {"lane_width": 3.5, "valid": {"x": [-END, END]}},
+    has_weather=True,
+)

@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from advsearch.scene.assets import Doubles, Floats
-from advsearch.scene.places.quads import WETNESS, reflectance
+from scenes.places.road import WETNESS, reflectance
 
 Color = tuple[float, float, float]
 PERIOD = 5.2  # strips repeat along this: two bays of a front

@@ -5,18 +5,18 @@ The object stands at the origin as at the stop line, and the other street is `AH
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
+from advsearch.scene.assets import Mesh
 from advsearch.scene.geometry import rotation
 from advsearch.scene.library import load_object
-from advsearch.scene.parts import MeshPart, mesh_part
-from advsearch.scene.places import avenue, paint
-from advsearch.scene.places.avenue import END, KERB, StreetPlan, Tree, asphalt, level, painted, street
-from advsearch.scene.places.houses import DEPTH
-from advsearch.scene.places.paint import BAY, FRONTS
-from advsearch.scene.places.quads import FRONT, KERBS, TOP, Quads, Wall
+from scenes.places import avenue, paint
+from scenes.places.avenue import END, KERB, StreetPlan, Tree, asphalt, level, painted, street
+from scenes.places.houses import DEPTH
+from scenes.places.models import Look, Node, Primitive, make_primitive
+from scenes.places.paint import BAY, FRONTS
+from scenes.places.quads import FRONT, TOP, Quads, Wall
+from scenes.places.road import KERBS
 
 AHEAD = 14.0  # x of the middle of the other street, which is as wide
 MIDDLE = sum(KERBS) / 2.0
@@ -60,25 +60,23 @@ def _ground() -> Quads:
     return quads
 
 
-def _sign(metres: float) -> tuple[MeshPart, ...]:
+def _sign() -> tuple[dict[str, Look], tuple[Node, ...]]:
+    """Return the bundled stop sign on a post instead of its stand, each of its materials as one of its own."""
     asset, post = load_object("stop-sign"), Quads()
     assert asset.metres is not None
     foot, low = np.array([*SIGN, KERB]), np.array([*SIGN, KERB + SIGN_LOW])
     avenue.limb(post, foot, low + np.array([0.0, 0.0, 0.1]), 0.035, 0.035, 10)
-    place = np.eye(4)
-    place[:3, :3] = asset.metres / metres * rotation(180.0, 0.0, 0.0)
-    place[:3, 3] = low / metres
-    kept = np.ones(len(asset.mesh.faces), bool)
-    kept[asset.mesh.materials["rubber"]] = False  # the foot of a stand, which stands on the ground
-    number = np.cumsum(kept) - 1
-    materials = {name: number[faces] for name, faces in asset.mesh.materials.items() if name != "rubber"}
-    asset = replace(asset, mesh=replace(asset.mesh, faces=asset.mesh.faces[kept], materials=materials))
-    sign = mesh_part("sign", asset, place, asset.material)
-    grey = np.full((2, 2, 3), 0.45, np.float32)
-    column = avenue.column(*SIGN, 0.035, KERB + SIGN_LOW, metres)
-    return replace(sign, laid=True), MeshPart(
-        "sign-post", post.mesh(metres), grey, avenue.IRON, laid=True, solids=(column,)
-    )
+    linear = asset.metres * rotation(180.0, 0.0, 0.0)
+    mesh = asset.mesh
+    vertices = (mesh.vertices.astype(np.float64) @ linear.T + low).astype(np.float32)
+    normals = (mesh.normals.astype(np.float64) @ linear.T / asset.metres).astype(np.float32)
+    looks, primitives = dict[str, Look](), list[Primitive]()
+    for name, look in (("face", "sign"), ("metal", "sign-metal"), ("post", "sign-tube")):
+        faces = mesh.faces[mesh.materials[name]]
+        primitives.append(Primitive(Mesh(vertices, faces, normals, mesh.uvs), look))
+        looks[look] = Look(asset.base_color, asset.finishes[name])
+    looks["sign-post"] = Look(np.full(3, 0.45, np.float32), avenue.IRON)
+    return looks, (Node(primitives), Node([make_primitive(post, "sign-post")]))
 
 
 def _fronts() -> tuple[tuple[Wall, float, float, int], ...]:
@@ -113,7 +111,14 @@ CROSSING = StreetPlan(
         *(Tree((NEAR - 2.1, FAR + 2.1)[n % 2], y, n) for n, y in enumerate((24.0, 33.0, 42.0, -19.0, -28.0, -37.0))),
     ),
     (*(post for post in avenue.posts_along() if _clear(post[0])), *avenue.posts_along((30.0, -1.0))),
-    _sign,
+    {
+        "day": {"map": "avenue", "lux": 75000.0},
+        "dusk": {"map": "avenue-dusk", "lux": 12.0},
+        "night": {"map": "avenue-night", "lux": 0.3},
+    },
+    {"lane_width": 3.5, "valid": {"x": [-END, END], "y": [-SIDE_END, SIDE_END]}},
+    *_sign(),
+    (avenue.round_solid("the post of a sign", [SIGN], 0.035, KERB + SIGN_LOW),),
 )
 
 
@@ -169,4 +174,5 @@ CAR_PARK = StreetPlan(
         *((x, y, y + arm) for x in (-2.5, 13.5) for y, arm in ((-WIDE * 5.5, -1.7), (WIDE * 5.5, 1.7))),
         *((-13.0, sign * (HALF + 0.6), sign * (HALF - 1.1)) for sign in (-1.0, 1.0)),
     ),
+    CROSSING.lights,
 )

@@ -1,0 +1,52 @@
+"""Environments that are a place: ``--environment my-street/place.yaml``, or one of its lights, ``place.yaml#night``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from advsearch.errors import UnknownNameError
+from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.grounds import LUMINANCE, irradiance
+from advsearch.scene.importing.files import safe_name
+from advsearch.scene.library import import_environment, list_environments, load_environment
+from advsearch.scene.places.place_file import find_beside, read_place, read_place_file, split_light
+from advsearch.trust.stored_files import reading
+
+
+def import_place(spec: str) -> EnvironmentAsset:
+    """Read a place with its light, the first in its file or the one that is named.
+
+    Raises:
+        FileFormatError, InputError: a file is missing, damaged, outside of the folder, or says something else.
+        UnknownNameError: the place has no such light, mesh or variant, or there is no such bundled environment.
+    """
+    name, chosen = split_light(spec)
+    path = Path(name)
+    with reading(path):
+        file = read_place_file(path)
+        light_name = next(iter(file.lights)) if chosen is None else chosen
+        if light_name not in file.lights:
+            raise UnknownNameError(f"light of {path}:", light_name, file.lights, f"Write it as {path}#NAME.")
+        light = file.lights[light_name]
+        place = read_place(path, file, light.variant)
+        if light.map in list_environments():
+            lit = load_environment(light.map)
+        else:
+            lit = import_environment(find_beside(path, light.map))
+    candelas = None
+    if light.lux is not None:
+        arriving = irradiance(torch.from_numpy(lit.radiance.copy())) @ torch.tensor(LUMINANCE)
+        candelas = light.lux / max(float(arriving), 1e-30)
+    return replace(
+        lit,
+        name=place.name if chosen is None else safe_name(Path(f"{place.name}-{light_name}.x")),
+        source=spec,
+        warnings=(*lit.warnings, *place.notes),
+        photographed=False,
+        ground=None,
+        candelas=candelas,
+        place=place,
+    )

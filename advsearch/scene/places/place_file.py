@@ -1,0 +1,229 @@
+"""The YAML file of a place: which of its meshes is ground, what shines, what is solid, and the light it stands in.
+
+    mesh: street.glb
+    ground: [road, pavement]
+    lane_width: 3.5
+    lamps: {street-lamps: [12354, 10437, 7774.5]}
+    lights:
+      day: {map: day.hdr, lux: 75000}
+      rain: {map: grey.hdr, lux: 9000, variant: wet}
+
+Lengths are metres, with the object at the origin, x ahead of it, y to its left and z up. The mesh has its own axes, as
+glTF says: y up, and z ahead of the object. All that has one material is one mesh, named by the material. A variant is
+one of KHR_materials_variants.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from advsearch.errors import FileFormatError, UnknownNameError
+from advsearch.scene.importing.files import safe_name
+from advsearch.scene.parts import Footprint, MeshPart, Solid
+from advsearch.scene.places.place_meshes import read_place_meshes
+from advsearch.trust.named_files import OUTSIDE, is_inside
+from advsearch.trust.stored_files import parsed, present_text, reading
+from advsearch.trust.yaml_text import LARGEST, parse_yaml
+
+SUFFIXES = (".yaml", ".yml")
+DEFAULT_LUMINANCE = 1000.0  # cd/m2 of a radiance of 1 where the light has no unit
+MOST_SOLIDS = 2000  # outlines of a place
+CORNERS = 8  # of the outline of what is round
+FARTHEST = 1e5  # largest length, metres
+
+T = TypeVar("T")
+Length = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, le=FARTHEST, allow_inf_nan=False)]
+Luminance = Annotated[float, Field(ge=0.0, le=1e9, allow_inf_nan=False)]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Bounds = tuple[Length, Length]
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SolidEntry(_Entry):
+    """What nothing else can be in: a convex outline on the ground, or a round one at some positions."""
+
+    name: Name  # as a sentence has it: "a house"
+    outline: Annotated[list[tuple[Length, Length]], Field(min_length=3, max_length=64)] | None = None
+    at: Annotated[list[tuple[Length, Length]], Field(min_length=1, max_length=MOST_SOLIDS)] | None = None
+    radius: Positive | None = None
+    heights: Bounds  # from and to
+
+    @model_validator(mode="after")
+    def _check_form(self) -> SolidEntry:
+        is_round = self.at is not None and self.radius is not None
+        if is_round == (self.outline is not None) or (self.at is None) != (self.radius is None):
+            raise ValueError("expected either an outline, or a radius and the positions that it is at")
+        if self.heights[0] >= self.heights[1]:
+            raise ValueError("heights: expected the lower one first")
+        return self
+
+    def list_footprints(self) -> list[Footprint]:
+        """Return the outlines, in metres."""
+        if self.outline is not None:
+            return [Footprint(np.array(self.outline), *self.heights)]
+        turn = np.arange(CORNERS) * (2.0 * np.pi / CORNERS)
+        circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        return [Footprint(np.array(center) + (self.radius or 0.0) * circle, *self.heights) for center in self.at or ()]
+
+
+class ValidEntry(_Entry):
+    """The box in which a camera has to be; what is not bounded is left out."""
+
+    x: Bounds | None = None
+    y: Bounds | None = None
+    z: Bounds | None = None
+
+    @model_validator(mode="after")
+    def _check_order(self) -> ValidEntry:
+        for axis, bounds in (("x", self.x), ("y", self.y), ("z", self.z)):
+            if bounds is not None and bounds[0] >= bounds[1]:
+                raise ValueError(f"{axis}: expected the lower bound first")
+        return self
+
+
+class PictureEntry(_Entry):
+    """What stands around, where the maps of the light show it: it fits the ground from near that place only."""
+
+    height: Positive  # above the ground from which the maps were taken
+    x: Bounds  # from and to, of what stands nearest
+    y: Bounds
+
+    @model_validator(mode="after")
+    def _check_inside(self) -> PictureEntry:
+        for axis, (low, high) in (("x", self.x), ("y", self.y)):
+            if not low < 0.0 < high:
+                raise ValueError(f"{axis}: expected bounds on both sides of the object, at 0")
+        return self
+
+
+class LightEntry(_Entry):
+    """A light that the place may stand in."""
+
+    map: Name  # an .hdr or .exr file in the folder, or the name of a bundled environment
+    lux: Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)] | None = None  # of level ground under open sky
+    variant: Name | None = None  # of the materials
+
+
+class PlaceFile(_Entry):
+    """What a place's file says."""
+
+    mesh: Name  # a .glb or .gltf file in the folder
+    ground: Annotated[list[Name], Field(min_length=1, max_length=64)]  # meshes that things stand on
+    lights: Annotated[dict[Name, LightEntry], Field(min_length=1, max_length=64)]  # the first is taken by itself
+    lane_width: Positive | None = None  # of the lane that the object drives in; None: there is none
+    floor: Length = 0.0  # height of the floor that cameras stand on, where the object stands on something
+    lamps: Annotated[dict[Name, tuple[Luminance, Luminance, Luminance]], Field(max_length=64)] = {}
+    """Luminance in cd/m2, for each colour channel, of meshes that shine when it is dark, and only then."""
+    solids: Annotated[list[SolidEntry], Field(max_length=MOST_SOLIDS)] = []
+    valid: ValidEntry = ValidEntry()
+    picture: PictureEntry | None = None  # None: nothing near is in the maps alone
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A place with one of its variants."""
+
+    name: str
+    file: PlaceFile
+    parts: tuple[MeshPart, ...]  # in metres; what they emit is in cd/m2
+    notes: tuple[str, ...] = ()  # what was left out, one sentence each
+
+
+def is_place_file(spec: object) -> bool:
+    """Whether an environment is asked for as the file of a place, perhaps with one of its lights: ``a.yaml#night``."""
+    return isinstance(spec, (str, Path)) and split_light(str(spec))[0].lower().endswith(SUFFIXES)
+
+
+def split_light(spec: str) -> tuple[str, str | None]:
+    """Return the file and the light of ``place.yaml#night``; None where it names no light."""
+    file, mark, light = spec.rpartition("#")
+    return (file, light) if mark and file.lower().endswith(SUFFIXES) and not os.path.exists(spec) else (spec, None)
+
+
+def read_place_file(path: Path) -> PlaceFile:
+    """Read the YAML file of a place. Raises FileFormatError: it is missing, is not YAML, or says something else."""
+    content = parsed(path, present_text(path, "the YAML file of a place", LARGEST), "YAML", parse_yaml)
+    if not isinstance(content, dict):
+        got = "an empty file" if content is None else type(content).__name__
+        raise FileFormatError(f"{path}: expected entries such as 'mesh: street.glb', got {got}")
+    try:
+        return PlaceFile.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"]))[:80]
+        problem = first["msg"].removeprefix("Value error, ")[:200]
+        raise FileFormatError(f"{path}: {where or 'the file'}: {problem}; docs/scenes.md has an example") from None
+
+
+def find_beside(path: Path, name: str) -> Path:
+    """Return a file that the file of a place names. Raises FileFormatError: it leads out of the folder."""
+    beside = path.parent / name
+    if "\0" in name or not is_inside(beside, path.parent):
+        raise FileFormatError(f"{path}: {name[:200]!r} {OUTSIDE}; put it beside the file")
+    return beside
+
+
+def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
+    """Read the meshes of a place. Raises FileFormatError, InputError: as for an imported object; UnknownNameError: it
+    has no such mesh or variant."""
+    parts, notes = read_place_meshes(find_beside(path, file.mesh), variant)
+    names = [part.name for part in parts]
+    for kind in (file.ground, file.lamps):
+        for name in kind:
+            if name not in names:
+                raise UnknownNameError(f"mesh of {file.mesh}:", name, names, f"It stands in {path}.")
+    solids = tuple(Solid(entry.name, outline) for entry in file.solids for outline in entry.list_footprints())
+    placed = [
+        replace(part, is_ground=part.name in file.ground, solids=solids if number == 0 else ())
+        for number, part in enumerate(parts)
+    ]
+    return Place(safe_name(path.parent), file, tuple(placed), tuple(notes))
+
+
+@lru_cache(maxsize=8)
+def load_bundled_place(name: str, variant: str | None = None) -> Place:
+    """Return a bundled place. Raises FileFormatError: the installation is damaged."""
+    with resources.as_file(resources.files("advsearch.bundled") / "data" / "places" / name) as folder:
+        path = folder / "place.yaml"
+        with reading(path):
+            return read_place(path, read_place_file(path), variant)
+
+
+@lru_cache(maxsize=4)
+def lay_place(place: Place, metres: float, candelas: float | None, *, is_dark: bool) -> tuple[MeshPart, ...]:
+    """Return the meshes of a place with lengths in the metres of one object size.
+
+    Args:
+        place: the place.
+        metres: of one object size.
+        candelas: luminance of a radiance of 1, cd/m2; None where the light has no unit, and its lamps stay off.
+        is_dark: whether its lamps shine.
+    """
+    unit = np.float32(candelas or DEFAULT_LUMINANCE)
+    shines = is_dark and candelas is not None
+    laid: list[MeshPart] = []
+    for part in place.parts:
+        emission = part.emission
+        if part.name in place.file.lamps:
+            emission = np.array([[place.file.lamps[part.name]]], np.float32) if shines else None
+        solids = tuple(
+            Solid(name, Footprint(outline / metres, low / metres, high / metres))
+            for name, (outline, low, high) in part.solids
+        )
+        mesh = replace(part.mesh, vertices=part.mesh.vertices / np.float32(metres))
+        laid.append(
+            replace(part, place=place, mesh=mesh, solids=solids, emission=None if emission is None else emission / unit)
+        )
+    return tuple(laid)

@@ -1,0 +1,294 @@
+"""The meshes of a place from a glTF file: one for each material, as far as a variant leaves it one.
+
+Beside what is read of an object's file, materials have the strength of their reflection (KHR_materials_ior and
+KHR_materials_specular) and a clear coat, may repeat their textures, and may be others in a variant
+(KHR_materials_variants). Where a variant changes all that has a material, that mesh keeps its name and only looks
+otherwise; where it changes a part, the part becomes a mesh named by the other material: snow, on what faces up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, NamedTuple, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from advsearch.errors import FileFormatError, InputError, UnknownNameError
+from advsearch.pictures import without_pillows_limit
+from advsearch.scene.assets import Doubles, Ints, Material, Mesh, face_vectors
+from advsearch.scene.importing import gltf_skeleton
+from advsearch.scene.importing.files import Names, Notes, check_faces, damaged
+from advsearch.scene.importing.geometry import compute_turn
+from advsearch.scene.importing.gltf import GltfFile
+from advsearch.scene.importing.gltf_entries import Entry, Header, Index, MaterialEntry, Primitive
+from advsearch.scene.importing.gltf_parts import GltfSurfaces, Piece, left_out, read_piece
+from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, placed
+from advsearch.scene.importing.readers import read_mesh_bytes
+from advsearch.scene.importing.scenes import TAKEN
+from advsearch.scene.parts import BASE_COLOR, MeshPart
+
+SUFFIXES = (".glb", ".gltf")
+TEXTURE_LIMIT = 8192  # longest side of a texture; a facade is larger than what an object wears
+MOST_MESHES = 200
+REFLECTANCE = 0.08  # of a surface of specular 1 that faces the light
+DULL_COAT, GLOSSY_COAT = 0.1, 0.001  # width of the lobe of Mitsuba's clear coat, of gloss 0 and 1
+VARIANTS = "KHR_materials_variants"
+READ_HERE = ("KHR_materials_clearcoat", "KHR_materials_ior", "KHR_materials_specular", VARIANTS)
+UNNAMED = "mesh"  # what has no material
+
+M = TypeVar("M", bound=BaseModel)
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class _Extension(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+
+class _Ior(_Extension):
+    ior: Annotated[float, Field(ge=1.0, le=10.0)] = 1.5
+
+
+class _Specular(_Extension):
+    specularFactor: Unit = 1.0
+
+
+class _Clearcoat(_Extension):
+    clearcoatFactor: Unit = 0.0
+    clearcoatRoughnessFactor: Unit = 0.0
+
+
+class _Finish(_Extension):
+    """The extensions of a material that are read here."""
+
+    KHR_materials_ior: _Ior = _Ior()
+    KHR_materials_specular: _Specular = _Specular()
+    KHR_materials_clearcoat: _Clearcoat = _Clearcoat()
+
+
+class _VariantName(_Extension):
+    name: str
+
+
+class _Variants(_Extension):
+    """The variants of a file."""
+
+    variants: list[_VariantName] = []
+
+
+class _Mapping(_Extension):
+    """The material that a primitive has in some variants."""
+
+    material: Index
+    variants: list[Index]
+
+
+class _Mappings(_Extension):
+    mappings: list[_Mapping] = []
+
+
+def _read_extension(path: Path, model: type[M], held: object) -> M:
+    try:
+        return model.model_validate({} if held is None else held)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"]))[:80]
+        raise damaged(path, f"extensions as glTF has them ({where}: {first['msg'][:100]})", "others") from None
+
+
+def _extension_of(entry: Entry, name: str) -> object:
+    return entry.extensions.get(name) if isinstance(entry.extensions, dict) else None
+
+
+class DrawnPrimitive(NamedTuple):
+    """A primitive at one of its positions in the file."""
+
+    material: int | None  # its own
+    shown_material: int | None  # the one that it has in the variant
+    part: ImportedPart  # without surface
+
+
+NameAndMaterial = tuple[str, int | None]
+
+
+def read_place_meshes(path: Path, variant: str | None) -> tuple[list[MeshPart], list[str]]:
+    """Read the meshes of a place, in metres, z up, with what they emit in cd/m2, and notes on what is left out.
+
+    Args:
+        path: the glTF file.
+        variant: name of a variant of its materials; None for none.
+
+    Raises:
+        FileFormatError: it is missing, damaged, over a limit, or has no faces.
+        InputError: its geometry has NaN or infinite numbers, or it has too many materials.
+        UnknownNameError: it has no such variant.
+    """
+    notes = Notes(path)
+    file = GltfFile(path, read_mesh_bytes(path, "environment", SUFFIXES))
+    header = file.header
+    number = None if variant is None else _find_variant(path, header, variant)
+    with without_pillows_limit(), np.errstate(all="ignore"):
+        drawn, surfaces = _read_primitives(file, number, notes)
+    used = [name for name in header.extensionsUsed if name not in READ_HERE]
+    required = [name for name in header.extensionsRequired if name not in READ_HERE]
+    left_out(header.model_copy(update={"extensionsUsed": used, "extensionsRequired": required}), notes)
+    check_faces(path, sum(len(primitive.part.faces) for primitive in drawn))
+    groups = _group_by_material(header, drawn)
+    if not groups:
+        raise FileFormatError(f"{path}: expected meshes with faces, got none; export triangles")
+    if len(groups) > MOST_MESHES:
+        raise InputError(f"{path}: expected at most {MOST_MESHES} materials, got {len(groups)}; join some of them")
+    names, parts = Names(TAKEN), list[MeshPart]()
+    for (name, material), members in groups.items():
+        part = _make_part(path, names.free(name), members, surfaces[material])
+        parts.append(_with_finish(path, header, material, part))
+    return parts, list(notes)
+
+
+def _find_variant(path: Path, header: Header, variant: str) -> int:
+    held = _read_extension(path, _Variants, _extension_of(header, VARIANTS))
+    names = [entry.name for entry in held.variants]
+    if variant not in names:
+        raise UnknownNameError(f"variant of {path.name}:", variant, names)
+    return names.index(variant)
+
+
+def _shown_material(path: Path, header: Header, primitive: Primitive, variant: int | None) -> int | None:
+    """Return the material that a primitive has in a variant, by its number."""
+    extension = _extension_of(primitive, VARIANTS)
+    if variant is None or extension is None:
+        return primitive.material
+    for mapping in _read_extension(path, _Mappings, extension).mappings:
+        if variant in mapping.variants:
+            if mapping.material >= len(header.materials):
+                expected = f"glTF with {mapping.material + 1} materials, as it refers to"
+                raise damaged(path, expected, f"{len(header.materials)}")
+            return mapping.material
+    return primitive.material
+
+
+def _read_primitives(
+    file: GltfFile, variant: int | None, notes: Notes
+) -> tuple[list[DrawnPrimitive], dict[int | None, ImportedSurface]]:
+    """Return what the file's nodes draw, and the surface of each material that is shown."""
+    header, path = file.header, file.path
+    poses = sorted(gltf_skeleton.poses(header), key=lambda item: item[0])
+    drawn_meshes = [(mesh, pose) for node, pose in poses if (mesh := header.nodes[node].mesh) is not None]
+    pieces: dict[tuple[int, int], Piece] = {}
+    for mesh in dict.fromkeys(mesh for mesh, _ in drawn_meshes):
+        for number, primitive in enumerate(header.meshes[mesh].primitives):
+            shown = primitive.model_copy(update={"material": _shown_material(path, header, primitive, variant)})
+            piece = read_piece(file, shown, header.meshes[mesh].extras, False)
+            if piece is not None and len(piece.part.faces):
+                pieces[mesh, number] = piece
+    by_material: dict[int | None, list[Piece]] = {}
+    for piece in pieces.values():
+        by_material.setdefault(piece.material, []).append(piece)
+    readers = GltfSurfaces(file, notes, TEXTURE_LIMIT)
+    fitted = {material: readers.surface(material, members) for material, members in by_material.items()}
+    drawn: list[DrawnPrimitive] = []
+    for mesh, pose in drawn_meshes:
+        for number, primitive in enumerate(header.meshes[mesh].primitives):
+            if (mesh, number) not in pieces:
+                continue
+            piece = pieces[mesh, number]
+            _, scale, shift = fitted[piece.material]
+            uvs = piece.part.uvs
+            if uvs is not None:
+                uvs = (uvs * scale + shift) * [1.0, -1.0] + [0.0, 1.0]
+            part = placed(replace(piece.part, uvs=uvs), pose)
+            drawn.append(DrawnPrimitive(primitive.material, piece.material, part))
+    return drawn, {material: surface for material, (surface, _, _) in fitted.items()}
+
+
+def _group_by_material(header: Header, drawn: Sequence[DrawnPrimitive]) -> dict[NameAndMaterial, list[ImportedPart]]:
+    """Return the primitives of each mesh, by its name and the material that it shows, in the order of materials."""
+    shown_by: dict[int | None, set[int | None]] = {}
+    for primitive in drawn:
+        shown_by.setdefault(primitive.material, set()).add(primitive.shown_material)
+    groups: dict[NameAndMaterial, list[ImportedPart]] = {}
+    for own, shown, part in drawn:
+        is_covered = len(shown_by[own]) > 1 and shown != own  # in part
+        name = _name_material(header, shown if is_covered else own)
+        groups.setdefault((name, shown), []).append(part)
+    return dict(sorted(groups.items(), key=lambda item: -1 if item[0][1] is None else item[0][1]))
+
+
+def _name_material(header: Header, number: int | None) -> str:
+    return UNNAMED if number is None else header.materials[number].name or f"material {number}"
+
+
+def _make_part(path: Path, name: str, members: Sequence[ImportedPart], surface: ImportedSurface) -> MeshPart:
+    color = np.full(3, NEUTRAL, np.float32) if surface.color is None else surface.color
+    base = np.broadcast_to(color, (2, 2, len(color))) if surface.texture is None else surface.texture
+    opacity = np.ascontiguousarray(base[..., 3]) if base.shape[-1] == 4 else None
+    try:
+        mesh = _join(members)
+    except InputError as error:  # which knows of no file
+        raise InputError(f"{path}: {name}: {error}") from None
+    return MeshPart(
+        name=name,
+        mesh=mesh,
+        base_color=np.ascontiguousarray(base[..., :3]),
+        material=Material().with_values(vars(surface), ""),
+        opacity=opacity,
+        normal_map=surface.normal_map,
+        emission=surface.emission,
+    )
+
+
+def _with_finish(path: Path, header: Header, number: int | None, part: MeshPart) -> MeshPart:
+    """Return a mesh with the specular and the clear coat of its material."""
+    entry = MaterialEntry() if number is None else header.materials[number]
+    finish = _read_extension(path, _Finish, entry.extensions)
+    ior = finish.KHR_materials_ior.ior
+    facing = finish.KHR_materials_specular.specularFactor * ((ior - 1.0) / (ior + 1.0)) ** 2
+    specular = min(round(facing / REFLECTANCE, 9), 1.0)
+    coat = finish.KHR_materials_clearcoat
+    material = replace(part.material, specular=specular, clearcoat=coat.clearcoatFactor)
+    part = replace(part, material=material)
+    is_plain = part.opacity is None and part.normal_map is None
+    if coat.clearcoatFactor == 0.0 or not is_plain:
+        return part
+    gloss = (DULL_COAT - coat.clearcoatRoughnessFactor**2) / (DULL_COAT - GLOSSY_COAT)
+    principled = {
+        "type": "principled",
+        "base_color": {"type": BASE_COLOR, "filter_type": "bilinear"},
+        **vars(material),
+        "clearcoat_gloss": min(max(gloss, 0.0), 1.0),
+    }
+    return replace(part, surface={"type": "twosided", "bsdf": principled})
+
+
+def _join(members: Sequence[ImportedPart]) -> Mesh:
+    """Return parts of a file as one mesh, z up, its front along +x."""
+    turn = compute_turn("y", "+z")
+    vertices, faces, normals, uvs = list[Doubles](), list[Ints](), list[Doubles](), list[Doubles]()
+    count = 0
+    for part in map(_with_normals, members):
+        vertices.append(part.vertices)
+        faces.append(part.faces + count)
+        normals.append(np.zeros_like(part.vertices) if part.normals is None else part.normals)
+        uvs.append(np.zeros((len(part.vertices), 2)) if part.uvs is None else part.uvs)
+        count += len(part.vertices)
+    directions = np.concatenate(normals)
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    return Mesh(
+        (np.concatenate(vertices) @ turn.T).astype(np.float32),
+        np.concatenate(faces).astype(np.uint32),
+        (directions / np.maximum(lengths, 1e-12) @ turn.T).astype(np.float32),
+        np.concatenate(uvs).astype(np.float32),
+    )
+
+
+def _with_normals(part: ImportedPart) -> ImportedPart:
+    """Return a part with the normals of its faces where it has none."""
+    if part.normals is not None:
+        return part
+    corners = part.vertices[part.faces]
+    normals = np.repeat(face_vectors(corners), 3, axis=0)
+    uvs = None if part.uvs is None else part.uvs[part.faces].reshape(-1, 2)
+    faces = np.arange(len(normals)).reshape(-1, 3)
+    return replace(part, vertices=corners.reshape(-1, 3), faces=faces, normals=normals, uvs=uvs)

@@ -1,0 +1,274 @@
+"""Places of one's own: a glTF file and a YAML file beside it, as the environment of any scene."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from advsearch.cli.main import main
+from advsearch.engine.loading import load_scene
+from advsearch.errors import FileFormatError, InputError, UnknownNameError
+from advsearch.runs.summary import file_digests
+from advsearch.scene.assets import Material, Mesh, Shape
+from advsearch.scene.description import describe
+from advsearch.scene.geometry import standing
+from advsearch.scene.glb import glb
+from advsearch.scene.grounds import LUMINANCE, enclosed, has_lanes, irradiance, past, paved, surroundings_of, view_of
+from advsearch.scene.library import import_environment, load_environment
+from advsearch.scene.places.place_file import is_place_file, load_bundled_place, read_place_file, split_light
+from scenes.files import exr
+from scenes.places import PLACES
+from scenes.places.models import Look, Node, PlaceModel, Primitive
+from scenes.places.models import glb as write_glb
+
+pytestmark = pytest.mark.usefixtures("two_threads")
+
+BUNDLED = Path(__file__).resolve().parents[2] / "advsearch/bundled/data/places"
+FILE = {
+    "mesh": "street.glb",
+    "ground": ["road"],
+    "lane_width": 3.0,
+    "lamps": {"lamp": [1000.0, 800.0, 500.0]},
+    "lights": {"day": {"map": "sky.exr", "lux": 20000.0}, "night": {"map": "sky.exr", "lux": 0.5}},
+    "solids": [
+        {"name": "a house", "outline": [[-10, 5], [10, 5], [10, 9], [-10, 9]], "heights": [0, 6]},
+        {"name": "a post", "at": [[4, -4]], "radius": 0.2, "heights": [0, 3]},
+    ],
+    "valid": {"x": [-30, 30]},
+}
+
+
+def box(name: str, low: tuple[float, float, float], high: tuple[float, float, float], color: float) -> Shape:
+    """Return a box whose faces look outwards, each with vertices of its own."""
+    corners, faces, normals = list[list[float]](), list[list[int]](), list[list[float]]()
+    bounds = np.array([low, high])
+    for axis in range(3):
+        for side in (0, 1):
+            across = [(axis + 1) % 3, (axis + 2) % 3]
+            square = [(0, 0), (1, 0), (1, 1), (0, 1)]
+            for a, b in square if side else square[::-1]:
+                corner = [0.0, 0.0, 0.0]
+                corner[axis], corner[across[0]], corner[across[1]] = (
+                    bounds[side, axis],
+                    bounds[a, across[0]],
+                    bounds[b, across[1]],
+                )
+                corners.append(corner)
+                normals.append((np.eye(3)[axis] * (2 * side - 1)).tolist())
+            first = len(corners) - 4
+            faces += [[first, first + 1, first + 2], [first, first + 2, first + 3]]
+    uvs = np.tile(np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32), (6, 1))
+    mesh = Mesh(
+        np.array(corners, np.float32), np.array(faces, np.uint32), np.array(normals, np.float32), uvs.astype(np.float32)
+    )
+    return Shape(name, mesh, np.full((2, 2, 3), color, np.float32), Material(roughness=0.9, specular=0.25))
+
+
+@pytest.fixture
+def street(tmp_path: Path) -> Path:
+    """A road with a house on its left and a lamp over it, under a grey sky."""
+    folder = tmp_path / "my-street"
+    folder.mkdir()
+    shapes = [
+        box("road", (-40, -8, -0.5), (40, 8, 0), 0.3),
+        box("house", (-10, 5, 0), (10, 9, 6), 0.6),
+        box("lamp", (3.8, -4.2, 3), (4.2, -3.8, 3.1), 0.8),
+    ]
+    (folder / "street.glb").write_bytes(glb(shapes))
+    sky = np.full((16, 32, 3), 0.8, np.float32)
+    sky[8:] = 0.2
+    (folder / "sky.exr").write_bytes(exr(sky))
+    write(folder / "place.yaml")
+    return folder / "place.yaml"
+
+
+def write(path: Path, **changes: object) -> Path:
+    content = {name: value for name, value in {**FILE, **changes}.items() if value is not None}
+    path.write_text(yaml.safe_dump(content), "utf-8")
+    return path
+
+
+def test_a_street_of_ones_own_stands_around_the_object_to_scale(street: Path) -> None:
+    scene = describe("car", street)
+    assert {"road", "house", "lamp"} == {name for name, part in scene.around.items() if part.laid}
+    assert paved(scene) and enclosed(scene) and has_lanes(scene)
+    house = standing(scene.around["house"]) * scene.metres
+    np.testing.assert_allclose([house.min(axis=0), house.max(axis=0)], [[-10, 5, 0], [10, 9, 6]], atol=1e-4)
+    assert scene.around["road"].material.specular == pytest.approx(0.25)
+    assert scene.environment is not None and scene.environment.name == "my-street"
+    assert scene.notes == (), scene.notes
+    assert not paved(describe("car", street, given={"ground.kind": "table"}))
+    assert not describe("car", street, given={"ground.size": 0.0}).around
+    assert not has_lanes(describe("car", write(street, lane_width=None)))
+
+
+def test_the_light_of_a_place_has_a_unit_and_its_lamps_shine_by_night(street: Path) -> None:
+    day, night = describe("car", street), describe("car", f"{street}#night")
+    lit = import_environment(street.parent / "sky.exr")
+    level = float(irradiance(torch.from_numpy(lit.radiance.copy())) @ torch.tensor(LUMINANCE))
+    assert day.environment is not None and night.environment is not None
+    assert day.environment.candelas == pytest.approx(20000.0 / level)
+    assert day.around["lamp"].emission is None
+    shown = night.around["lamp"].emission
+    assert shown is not None and night.environment.candelas is not None
+    np.testing.assert_allclose(shown[0, 0] * night.environment.candelas, [1000.0, 800.0, 500.0], rtol=1e-5)
+    assert night.environment.name == "my-street-night"
+    without = write(street, lights={"day": {"map": "noon"}})
+    plain = describe("car", without).environment
+    assert plain is not None and plain.candelas is None
+    assert np.array_equal(plain.radiance, load_environment("noon").radiance)
+
+
+def test_notes_say_what_stands_in_a_solid_and_where_a_place_ends(street: Path) -> None:
+    inside = describe("car", street, things="car@0,7; person@4,-4")
+    assert sum("stands in a house" in note for note in inside.notes) == 1
+    assert sum("stands in a post" in note for note in inside.notes) == 1
+    near, far = (describe("car", street, given={"camera.distance": away}) for away in (10.0, 90.0))
+    assert past(near, [view_of(near)]) == ()
+    (said,) = past(far, [view_of(far)])
+    assert "x -30 to 30 m" in said and "the camera is outside" in said
+    (some,) = past(far, [view_of(near), view_of(far)])
+    assert "50 % of the views are outside" in some
+
+
+def test_a_command_renders_in_it_and_its_files_belong_to_the_run(
+    street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    command = "render --object car --environment my-street/place.yaml#night --out street.png --resolution 24 --spp 2"
+    assert main([*command.split(), "--quiet"]) == 0
+    assert (tmp_path / "street.png").is_file()
+    digests = file_digests({"environment": "my-street/place.yaml#night"})
+    assert {Path(path).name for path in digests} == {"place.yaml", "street.glb", "sky.exr"}
+
+
+def test_the_picture_shows_the_place(street: Path) -> None:
+    scene = load_scene("car", str(street), settings={"camera.distance": 12.0, "camera.azimuth": 270.0})
+    renderer = scene.renderer(["pose"], resolution=24, denoise="none")
+    names = {name for name in scene.description.around if bool(renderer.surfaces(renderer.start).seen(name).any())}
+    assert {"road", "house"} <= names
+
+
+WRONG: list[tuple[dict[str, object], type[InputError], str]] = [
+    ({"mesh": None}, FileFormatError, r"place.yaml: mesh: Field required; docs/scenes.md has an example"),
+    ({"colour": "red"}, FileFormatError, r"place.yaml: colour: Extra inputs are not permitted"),
+    ({"ground": []}, FileFormatError, r"ground: List should have at least 1 item"),
+    ({"ground": ["raod"]}, UnknownNameError, r"unknown mesh of street.glb: 'raod'. Did you mean 'road'\?"),
+    ({"lamps": {"lamp": [1.0, -1.0, 0.0]}}, FileFormatError, r"lamps.lamp.1: Input should be greater than or equal"),
+    ({"lamps": {"bulb": [1.0, 1.0, 1.0]}}, UnknownNameError, r"'bulb'"),
+    ({"lights": {}}, FileFormatError, r"lights: Dictionary should have at least 1 item"),
+    ({"lights": {"day": {"map": "day.exr"}}}, FileFormatError, r"day.exr: no such environment file"),
+    ({"lights": {"day": {"map": "../sky.exr"}}}, FileFormatError, r"'../sky.exr' is outside its folder"),
+    ({"lights": {"day": {"map": "sky.exr", "variant": "wet"}}}, UnknownNameError, r"variant of street.glb: 'wet'"),
+    ({"lights": {"day": {"map": "sky.exr", "lux": 0}}}, FileFormatError, r"lights.day.lux: Input should be greater"),
+    ({"mesh": "../street.glb"}, FileFormatError, r"'../street.glb' is outside its folder and is not read"),
+    ({"mesh": "/etc/passwd"}, FileFormatError, r"'/etc/passwd' is outside its folder"),
+    ({"mesh": "link.glb"}, FileFormatError, r"'link.glb' is outside its folder"),
+    ({"mesh": "pipe.glb"}, FileFormatError, r"pipe.glb: expected an environment file, got a pipe"),
+    ({"mesh": "street.obj"}, FileFormatError, r"street.obj: expected an environment file ending in .glb or .gltf"),
+    ({"mesh": "street\0.glb"}, FileFormatError, r"is outside its folder"),
+    ({"valid": {"x": [30, -30]}}, FileFormatError, r"valid: x: expected the lower bound first"),
+    ({"picture": {"height": 1.5, "x": [2, 9], "y": [-9, 9]}}, FileFormatError, r"picture: x: expected bounds on both"),
+    ({"lane_width": float("inf")}, FileFormatError, r"lane_width: Input should be"),
+    ({"solids": [{"name": "a wall", "heights": [0, 1]}]}, FileFormatError, r"solids.0: expected either an outline"),
+    ({"solids": [{"name": "a wall", "at": [[0, 0]], "radius": 1, "heights": [2, 1]}]}, FileFormatError, r"heights"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "error", "message"), WRONG)
+def test_a_file_that_says_something_else_is_refused_with_a_reason(
+    street: Path, changes: dict[str, object], error: type[InputError], message: str
+) -> None:
+    outside = street.parent.parent / "other.glb"
+    outside.write_bytes((street.parent / "street.glb").read_bytes())
+    (street.parent / "link.glb").symlink_to(outside)
+    os.mkfifo(street.parent / "pipe.glb")
+    write(street, **changes)
+    with pytest.raises(error, match=message):
+        describe("car", street)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"expected entries such as 'mesh: street.glb', got an empty file"),
+        ("- a", r"got list"),
+        ("mesh: [", r"expected YAML"),
+        ("mesh: !!python/object/apply:os.system [ls]", r"the tag"),
+        ("a: " + "b" * (1 << 17), r"of at most 131,072 bytes"),
+    ],
+)
+def test_text_that_is_no_place_is_refused(street: Path, text: str, message: str) -> None:
+    street.write_text(text, "utf-8")
+    with pytest.raises(FileFormatError, match=message):
+        describe("car", street)
+
+
+def test_what_is_missing_is_named(street: Path) -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown light of .*place.yaml: 'nihgt'. Did you mean 'night'\?"):
+        describe("car", f"{street}#nihgt")
+    with pytest.raises(FileFormatError, match=r"nowhere.yaml: expected the YAML file of a place, got No such file"):
+        describe("car", street.parent / "nowhere.yaml")
+
+
+def test_a_spec_names_a_light_behind_the_file() -> None:
+    assert split_light("a/place.yaml#night") == ("a/place.yaml", "night")
+    assert split_light("a/place.yml") == ("a/place.yml", None)
+    assert is_place_file("a/Place.YAML#x") and not is_place_file("street") and not is_place_file("a.hdr#x")
+
+
+@pytest.mark.parametrize("name", sorted(PLACES))
+def test_a_bundled_place_opens_as_one_of_ones_own(name: str) -> None:
+    path = BUNDLED / name / "place.yaml"
+    own = load_bundled_place(name)
+    assert own.notes == () and read_place_file(path) == own.file
+    scene = describe("car" if name != "room" else "mug", path)
+    assert [part.name for part in own.parts] == list(scene.around)
+    environment = scene.environment
+    assert environment is not None
+    if name == "road":  # whose maps have no unit
+        assert environment.candelas is None
+        return
+    bundled = load_environment(name)
+    few_rows = name == "room"  # whose map has four: each quadrature has its own light
+    assert environment.candelas == pytest.approx(bundled.candelas, rel=0.15 if few_rows else 0.02)
+
+
+def test_a_road_before_a_picture_holds_as_far_as_the_bundled_street_does() -> None:
+    given = {"camera.distance": 30.0, "camera.azimuth": 90.0}
+    own, street = (describe("car", name, given=given) for name in (BUNDLED / "road" / "place.yaml", "street"))
+    assert surroundings_of(own) == surroundings_of(street)
+    assert "the place around the object is a picture" in past(own, [view_of(own)])[0]
+
+
+def test_a_variant_keeps_the_name_of_what_it_changes_as_a_whole(street: Path) -> None:
+    """A wet road is still the road; snow on a part of a house is a mesh of its own."""
+    road, house = box("road", (-40, -8, -0.5), (40, 8, 0), 0.3).mesh, box("house", (-10, 5, 0), (10, 9, 6), 0.6).mesh
+    walls, roof = (replace(house, faces=house.faces[part]) for part in (slice(0, 10), slice(10, 12)))
+    grey, white = np.full(3, 0.4, np.float32), np.full(3, 0.9, np.float32)
+    dull = Material(roughness=0.9)
+    looks = {
+        "road": Look(grey, dull),
+        "wet-road": Look(grey, Material(roughness=0.1, specular=0.6, clearcoat=0.5)),
+        "house": Look(grey, dull),
+        "snow": Look(white, dull),
+    }
+    nodes = [
+        Node([Primitive(road, "road", {"wet": "wet-road"})]),
+        Node([Primitive(walls, "house"), Primitive(roof, "house", {"snow": "snow"})]),
+    ]
+    (street.parent / "street.glb").write_bytes(write_glb(PlaceModel(looks, nodes, {})))
+    lights = {name: {"map": "sky.exr", "variant": name} for name in ("wet", "snow")}
+    write(street, lamps={}, lights={"dry": {"map": "sky.exr"}, **lights})
+    dry, wet, snow = (describe("car", f"{street}#{light}").around for light in ("dry", "wet", "snow"))
+    assert set(dry) == set(wet) == {"road", "house"} and set(snow) == {"road", "house", "snow"}
+    assert wet["road"].material == Material(roughness=0.1, specular=0.6, clearcoat=0.5)
+    assert dry["road"].material == dull
+    assert len(dry["house"].mesh.faces) == 12 == len(snow["house"].mesh.faces) + len(snow["snow"].mesh.faces)
+    assert (snow["snow"].mesh.normals[:, 2] == 1.0).all() and snow["snow"].base_color.max() > 0.89
