@@ -154,7 +154,7 @@ class ThingsControl(Control):
             way = asked - middle_of
             way = way / np.linalg.norm(way) if way.any() else np.array([1.0, 0.0])
             pushed = 0.0
-            in_solids = [] if away else [geometry.blocked(here, solid, way) for solid in solids]
+            in_solids = [] if away else [geometry.blocked(here, solid.footprint, way) for solid in solids]
             if any(begin < 0.0 < end for begin, end in in_solids):
                 pushed = min(begin for begin, end in in_solids if begin < 0.0 < end) - GAP / metres
             in_others = [] if away else [geometry.blocked(here, other, way) for other in others]

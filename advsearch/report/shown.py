@@ -284,7 +284,7 @@ def extent_of(what: str, rate: VerifiedRate | None) -> Extent | None:
 
 
 def counted(what: str, count: int, total: int, interval: Interval | None, share: float | None = None) -> Extent:
-    return Extent.of(what, count, total, interval, share)
+    return Extent.from_count(what, count, total, interval, share)
 
 
 def nothing_claimed(why: str, more: str = "") -> Claim:

@@ -40,7 +40,7 @@ def test_a_thing_that_moves_stays_out_of_houses_and_posts() -> None:
         mesh = space.scene.meshes["person"].mesh.vertices
         pose = inputs["person.to_world"].double().numpy()
         taken = footprint(mesh @ pose[:3, :3].T + pose[:3, 3])
-        assert not any(overlapping(solid, taken) for solid in solids)
+        assert not any(overlapping(solid.footprint, taken) for solid in solids)
     post = describe("car", "avenue", things="person@-15,-3.05")
     with pytest.raises(InputError, match="person stands in something else; put it elsewhere"):
         space_of(post, {"x": [-1.0, 1.0]})

@@ -322,5 +322,5 @@ def claims(result: CompareResult) -> Iterator[Claim]:
         if outcomes:
             statement += f" Of the others {pair.second} has {outcomes}."
         what = f"configurations in which {pair.second} is right"
-        extent = results.Extent.of(what, side.correct, side.configurations, side.interval, side.accuracy)
+        extent = results.Extent.from_count(what, side.correct, side.configurations, side.interval, side.accuracy)
         yield Claim(kind="measured", statement=statement, extent=extent)

@@ -43,7 +43,7 @@ class RightOf(Fields):
 
     def extent(self, what: str) -> results.Extent:
         """Return the count for a claim; `what` says what is counted."""
-        return results.Extent.of(what, self.right, self.total, self.interval, self.share)
+        return results.Extent.from_count(what, self.right, self.total, self.interval, self.share)
 
 
 class Confirmation(RightOf):

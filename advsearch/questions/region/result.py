@@ -144,7 +144,7 @@ def claims(result: RegionResult) -> Iterator[Claim]:
     if not result.samples or result.same is None or result.interval is None or result.verdict is None:
         return
     what = f"samples that are {result.verdict}"
-    extent = results.Extent.of(what, result.same, result.samples, result.interval)
+    extent = results.Extent.from_count(what, result.same, result.samples, result.interval)
     sides = [f"{side.name} {side.low:.4g} to {side.high:.4g} {side.unit}".strip() for side in result.box or ()]
     box = ", ".join(sides) or "the box"
     inside = f"{wording.share_text(extent)} samples drawn evenly from it"

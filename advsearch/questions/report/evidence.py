@@ -300,7 +300,7 @@ def photo_claims(photos: Any) -> list[Claim]:
     if not photos.photos or photos.interval is None:
         return []
     agreeing = photos.right_right + photos.wrong_wrong
-    extent = results.Extent.of("photographs that agree", agreeing, photos.photos, photos.interval)
+    extent = results.Extent.from_count("photographs that agree", agreeing, photos.photos, photos.interval)
     text = f"Photographs and renderings agree (both right, or both wrong) in {wording.share_text(extent)}."
     return [Claim(kind="measured", statement=f"{text} The interval takes photographs as independent.", extent=extent)]
 

@@ -190,7 +190,7 @@ class _SuiteRun:
         if command is None:
             return None
         defaults = {
-            power.name: power.default for power in config.powers if power.name not in type(config).place_settings
+            power.name: power.default for power in config.powers if power.name not in ("run", "overwrite")
         }
         without = [f"{name}={json.dumps(default)}" for name, default in defaults.items()]
         seed = ["fresh=false", f"seed={self.trial.suite.seed}"] if config.fresh else []
