@@ -24,6 +24,7 @@ from advsearch.attacks.verification import OVER_CONDITIONS as OVER_CONDITIONS
 from advsearch.calls import helped as helped
 from advsearch.config import DEFAULT_ENVIRONMENT as DEFAULT_ENVIRONMENT
 from advsearch.controls import CONTROLS as CONTROLS
+from advsearch.engine import loading as loading
 from advsearch.engine.image_changes import AWAY as AWAY
 from advsearch.engine.image_changes import as_claimed as as_claimed
 from advsearch.engine.image_changes import changed as changed
@@ -31,7 +32,11 @@ from advsearch.engine.journal import Journal as Journal
 from advsearch.engine.journal import Shared as Shared
 from advsearch.engine.journal import worker_call as worker_call
 from advsearch.engine.judging import judgements as judgements
+from advsearch.engine.loading import Scene as Scene
+from advsearch.engine.naming import AnyModel as AnyModel
+from advsearch.engine.naming import exists_here as exists_here
 from advsearch.engine.naming import in_turn as in_turn
+from advsearch.engine.naming import model_name as model_name
 from advsearch.engine.record import control_group as control_group
 from advsearch.engine.record import judged as judged
 from advsearch.engine.record import verified_rate as verified_rate
@@ -59,6 +64,7 @@ from advsearch.questions.attack.result import AttackResult as AttackResult
 from advsearch.questions.attack.summary import AttackSummary as AttackSummary
 from advsearch.questions.attack.summary import attack_of as attack_of
 from advsearch.questions.sweep.carry_out import scenes_of as scenes_of
+from advsearch.questions.sweep.summary import SweepSummary as SweepSummary
 from advsearch.registry import get_experiment as get_experiment
 from advsearch.registry import imported
 from advsearch.runs.store import Row as Row
@@ -67,10 +73,12 @@ from advsearch.scene.glb import glb as glb
 from advsearch.scene.grounds import paved as paved
 from advsearch.scene.importing.files import last_line as last_line
 from advsearch.scene.renderer import MAX_SPP as MAX_SPP
+from advsearch.settings import PythonOnly as PythonOnly
 from advsearch.tasks import AnyTask as AnyTask
 from advsearch.tasks import make_task as make_task
 from advsearch.tasks.base import Truth as Truth
 from advsearch.tasks.together import Together as Together
+from advsearch.trust.code import allow_named as allow_named
 from advsearch.trust.programs import find_blender as find_blender
 from advsearch.trust.programs import surroundings as surroundings
 
