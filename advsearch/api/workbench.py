@@ -64,6 +64,7 @@ from advsearch.questions.attack.result import AttackResult as AttackResult
 from advsearch.questions.attack.summary import AttackSummary as AttackSummary
 from advsearch.questions.attack.summary import attack_of as attack_of
 from advsearch.questions.sweep.carry_out import scenes_of as scenes_of
+from advsearch.questions.sweep.summary import AxisValue as AxisValue
 from advsearch.questions.sweep.summary import SweepSummary as SweepSummary
 from advsearch.registry import get_experiment as get_experiment
 from advsearch.registry import imported

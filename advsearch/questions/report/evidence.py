@@ -107,7 +107,7 @@ def conditions_of(result: results.Result, photographs: Sequence[Any] | None = No
     return conditions
 
 
-def _has(value: float | str, of: Any) -> bool:
+def _has(value: float | str, of: workbench.AxisValue) -> bool:
     if isinstance(value, str) or isinstance(of, str):
         return value == of
     return of[0] <= value <= of[1] if isinstance(of, tuple) else math.isclose(value, of)
