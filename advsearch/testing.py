@@ -17,21 +17,18 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advsearch.registry import get_experiment
-from advsearch.settings import PythonOnly
-from advsearch.trust.code import allow_named
+from advsearch.extend import get_experiment
 
 if TYPE_CHECKING:
-    from advsearch.engine.loading import Scene
-    from advsearch.engine.naming import AnyModel
-    from advsearch.runs.results import RunResult
+    from advsearch.extend import workbench
+    from advsearch.questions.test.result import ClaimResult, SuiteResult
 
 __all__ = ["assert_no_worse", "assert_not_broken", "assert_right", "assert_suite"]
 
 
 def assert_right(
-    object: str | Path | Scene,
-    model: AnyModel = "reference",
+    object: str | Path | workbench.Scene,
+    model: workbench.AnyModel = "reference",
     *,
     at_least: float = 0.95,
     pictures: int = 400,
@@ -39,7 +36,7 @@ def assert_right(
     seed: int = 0,
     run: str | Path | None = None,
     **settings: Any,
-) -> RunResult:
+) -> SuiteResult:
     """Assert that a model is right in at least a share of the pictures that the controls span.
 
     Pictures are drawn until that is shown or refuted at the stated confidence.
@@ -64,13 +61,13 @@ def assert_right(
 
 
 def assert_not_broken(
-    object: str | Path | Scene,
-    model: AnyModel = "reference",
+    object: str | Path | workbench.Scene,
+    model: workbench.AnyModel = "reference",
     *,
     seed: int = 0,
     run: str | Path | None = None,
     **settings: Any,
-) -> RunResult:
+) -> SuiteResult:
     """Assert that a search finds no configuration that a model gets wrong. That it finds none is no proof.
 
     Args:
@@ -86,9 +83,9 @@ def assert_not_broken(
 
 
 def assert_no_worse(
-    object: str | Path | Scene,
-    model: AnyModel,
-    than: AnyModel,
+    object: str | Path | workbench.Scene,
+    model: workbench.AnyModel,
+    than: workbench.AnyModel,
     *,
     points: float = 2.0,
     pictures: int = 1000,
@@ -96,7 +93,7 @@ def assert_no_worse(
     seed: int = 0,
     run: str | Path | None = None,
     **settings: Any,
-) -> RunResult:
+) -> SuiteResult:
     """Assert that a model is right at most so many percentage points less often than another, on the same pictures.
 
     Args:
@@ -113,7 +110,7 @@ def assert_no_worse(
     return _asserted(claim, object, {"model": model, "than": than}, settings, confidence, seed, run)
 
 
-def assert_suite(suite: str | Path, **settings: Any) -> RunResult:
+def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
     """Assert that all claims of a suite are held, or are what was expected when it was last updated.
 
     Args:
@@ -126,12 +123,12 @@ def assert_suite(suite: str | Path, **settings: Any) -> RunResult:
     """
     __tracebackhide__ = True
     # late: torch takes long to import
-    from advsearch.engine.naming import in_turn
+    from advsearch.extend import workbench
 
     experiment = get_experiment("test")
-    allow_named(settings)
-    with in_turn():
-        result: Any = experiment.run(experiment.settings(**{"suite": str(suite), **settings}))
+    workbench.allow_named(settings)
+    with workbench.in_turn():
+        result: SuiteResult = experiment.run(experiment.settings(**{"suite": str(suite), **settings}))
     if bad := [claim for claim in result.claims if not claim.accepted]:
         raise AssertionError("\n\n".join(_report(result, claim, claim.repeat) for claim in bad))
     return result
@@ -139,24 +136,24 @@ def assert_suite(suite: str | Path, **settings: Any) -> RunResult:
 
 def _asserted(
     claim: Mapping[str, object],
-    object: str | Path | Scene,
-    models: Mapping[str, AnyModel],
+    object: str | Path | workbench.Scene,
+    models: Mapping[str, workbench.AnyModel],
     settings: Mapping[str, Any],
     confidence: float,
     seed: int,
     run: str | Path | None,
-) -> RunResult:
+) -> SuiteResult:
     __tracebackhide__ = True
     # late: torch takes long to import
-    from advsearch.engine import loading
-    from advsearch.engine.naming import exists_here, in_turn, model_name
+    from advsearch.extend import workbench
 
+    loading = workbench.loading
     experiment = get_experiment("test")
     name = str(claim["claim"]).replace("_", "-")
     with ExitStack() as stack:
-        stack.enter_context(in_turn())
+        stack.enter_context(workbench.in_turn())
         for named in (settings, *({"model": one} for one in models.values())):
-            allow_named(named)
+            workbench.allow_named(named)
         given, said = dict(settings), dict(claim)
         if isinstance(object, loading.Scene):
             given |= {key: value for key, value in loading.scene_as_settings(object).items() if value is not None}
@@ -164,18 +161,22 @@ def _asserted(
         else:
             given["object"] = str(object)
         for key, model in models.items():
-            (given if key == "model" else said)[key] = model_name(model)
+            (given if key == "model" else said)[key] = workbench.model_name(model)
             if not isinstance(model, (str, Path)):
-                stack.enter_context(loading.lending(loading.MODEL, {model_name(model): model}))
+                stack.enter_context(loading.lending(loading.MODEL, {workbench.model_name(model): model}))
         if instances := loading.instances_in(given.get("controls", ())):
             stack.enter_context(loading.lending(loading.CONTROL, {one.name: one for one in instances}))
             given["controls"] = loading.settings_of(given["controls"])
         title = f"assert_{claim['claim']}"
         values = {"title": title, "settings": given, "seed": seed, "confidence": confidence, "claims": {name: said}}
-        only_here = [PythonOnly("call", f"of {title}")]
-        only_here += [PythonOnly("model", model_name(model)) for model in models.values() if exists_here(model)]
+        only_here = [workbench.PythonOnly("call", f"of {title}")]
+        only_here += [
+            workbench.PythonOnly("model", workbench.model_name(model))
+            for model in models.values()
+            if workbench.exists_here(model)
+        ]
         config = experiment.settings(suite=title, run=None if run is None else str(run)).with_only_here(only_here)
-        result: Any = experiment.run(config, suite=values)
+        result: SuiteResult = experiment.run(config, suite=values)
     (claimed,) = result.claims
     if claimed.answer != "held":
         test = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]
@@ -184,7 +185,7 @@ def _asserted(
     return result
 
 
-def _report(result: RunResult, claim: Any, again: str) -> str:
+def _report(result: SuiteResult, claim: ClaimResult, again: str) -> str:
     run = Path(result.run or "")
     lines = [f"{claim.name}: {claim.answer}: {claim.reason}", f"  claimed: {claim.statement}"]
     lines += [f"  picture: {(run / claim.picture).resolve()}"] if claim.picture else []

@@ -34,8 +34,11 @@ OTHER_ISLANDS = {
 }
 """Islands that no table of parts has, with what they are; `advsearch.registry` imports them by name."""
 
-ELSEWHERE = {"advsearch.cli.report": "advsearch.questions.report"}
-"""Modules that belong to an island, but stand in the folder of their kind."""
+ELSEWHERE = {
+    "advsearch.cli.report": "advsearch.questions.report",
+    "advsearch.testing": "advsearch.questions.test",
+}
+"""Modules that belong to an island, but stand where users or the command line look for them."""
 
 NOT_YET: frozenset[str] = frozenset(
     {

@@ -29,6 +29,7 @@ from advsearch.calls import helped as helped
 from advsearch.cluster import InProcess as InProcess
 from advsearch.config import DEFAULT_ENVIRONMENT as DEFAULT_ENVIRONMENT
 from advsearch.controls import CONTROLS as CONTROLS
+from advsearch.engine import loading as loading
 from advsearch.engine.image_changes import AWAY as AWAY
 from advsearch.engine.image_changes import as_claimed as as_claimed
 from advsearch.engine.image_changes import changed as changed
@@ -40,9 +41,12 @@ from advsearch.engine.judging import domain_of as domain_of
 from advsearch.engine.judging import judgements as judgements
 from advsearch.engine.loading import Scene as Scene
 from advsearch.engine.loading import load_scene as load_scene
+from advsearch.engine.naming import AnyModel as AnyModel
 from advsearch.engine.naming import check_run_settings as check_run_settings
+from advsearch.engine.naming import exists_here as exists_here
 from advsearch.engine.naming import in_turn as in_turn
 from advsearch.engine.naming import load_models as load_models
+from advsearch.engine.naming import model_name as model_name
 from advsearch.engine.naming import scene_settings as scene_settings
 from advsearch.engine.naming import settings_alone as settings_alone
 from advsearch.engine.record import control_group as control_group
@@ -81,6 +85,8 @@ from advsearch.questions.sweep.carry_out import scenes_of as scenes_of
 from advsearch.questions.sweep.display import surface_sentences as surface_sentences
 from advsearch.questions.sweep.predicting import prepare_surface_light as prepare_surface_light
 from advsearch.questions.sweep.stored import StoredSweep as StoredSweep
+from advsearch.questions.sweep.summary import AxisValue as AxisValue
+from advsearch.questions.sweep.summary import SweepSummary as SweepSummary
 from advsearch.registry import get_experiment as get_experiment
 from advsearch.registry import imported
 from advsearch.runs.store import Row as Row
@@ -93,12 +99,14 @@ from advsearch.scene.importing.files import last_line as last_line
 from advsearch.scene.parts import PluginPart as PluginPart
 from advsearch.scene.parts import sphere as sphere
 from advsearch.scene.renderer import MAX_SPP as MAX_SPP
+from advsearch.settings import PythonOnly as PythonOnly
 from advsearch.tasks import AnyTask as AnyTask
 from advsearch.tasks import make_task as make_task
 from advsearch.tasks.base import Truth as Truth
 from advsearch.tasks.together import Together as Together
 from advsearch.threads import all_for_torch as all_for_torch
 from advsearch.threads import cores as cores
+from advsearch.trust.code import allow_named as allow_named
 from advsearch.trust.programs import find_blender as find_blender
 from advsearch.trust.programs import surroundings as surroundings
 

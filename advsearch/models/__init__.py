@@ -17,6 +17,7 @@ from advsearch.models.model import (
     Preprocessing,
     RemoteNetwork,
     Triple,
+    sharing_copy,
     warn,
 )
 from advsearch.models.source import (
@@ -27,7 +28,6 @@ from advsearch.models.source import (
     library,
     load_weights,
     near_names,
-    sharing_copy,
     source_of,
     split_weights,
 )

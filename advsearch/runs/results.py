@@ -258,7 +258,9 @@ class Extent(Fields):
     )
 
     @classmethod
-    def from_count(cls, what: str, count: int, total: int, interval: Interval | None, share: float | None = None) -> Extent:
+    def from_count(
+        cls, what: str, count: int, total: int, interval: Interval | None, share: float | None = None
+    ) -> Extent:
         """Return a count with the interval of its share, which is `share` where that is not count over total."""
         own_share = share if total and share != count / total else None
         return cls(what=what, count=count, total=total, interval=interval or (0.0, 1.0), share=own_share)

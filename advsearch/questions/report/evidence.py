@@ -11,7 +11,7 @@ from contextlib import suppress
 from datetime import datetime, timezone
 from enum import Enum
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard, cast
 
 from advsearch.extend import (
     AdvsearchError,
@@ -44,6 +44,9 @@ from advsearch.questions.report.recorded import (
 )
 from advsearch.questions.report.result import ConditionShare, Evidence, EvidenceRun
 
+if TYPE_CHECKING:
+    from advsearch.extend import workbench
+
 # ---------------------------------------------------------------------------------------------------------------------
 # What an engineer reads of a run beside its claims: shares by condition, whether a criterion is met, how common
 # conditions are, the operational design domain in words, and what is not shown.
@@ -63,12 +66,13 @@ OTHER = "other"  # the part of what belongs to none of them
 Exposure = Mapping[str, Mapping[str, float]]  # how common the values of axes are: weights by axis and value
 
 
-def is_attack(result: Any) -> bool:
+def is_attack(result: results.Result) -> TypeGuard[workbench.AttackSummary]:
     """Whether a result is that of one attack, and not of a study of several."""
     return isinstance(result, get_experiment("attack").result)
 
 
-def is_sweep(result: Any) -> bool:
+def is_sweep(result: results.Result) -> TypeGuard[workbench.SweepSummary]:
+    """Whether a result is that of a sweep."""
     return isinstance(result, get_experiment("sweep").result)
 
 
@@ -103,7 +107,7 @@ def conditions_of(result: results.Result, photographs: Sequence[Any] | None = No
     return conditions
 
 
-def _has(value: float | str, of: Any) -> bool:
+def _has(value: float | str, of: workbench.AxisValue) -> bool:
     if isinstance(value, str) or isinstance(of, str):
         return value == of
     return of[0] <= value <= of[1] if isinstance(of, tuple) else math.isclose(value, of)
@@ -122,9 +126,9 @@ def met(criterion: float, interval: Interval) -> str:
 def chosen_axes(result: results.Result) -> list[str]:
     """Return the axes of a sweep whose several values somebody chose: they are not drawn, so that a share over them is
     one of these values."""
-    if not is_sweep(result):
-        return []
-    counts = Counter(row.axis for row in result.axes if row.axis not in result.drawn)
+    counts = Counter[str]()
+    if is_sweep(result):
+        counts.update(row.axis for row in result.axes if row.axis not in result.drawn)
     return [axis for axis, count in counts.items() if count > 1 and axis not in ("model", "answer")]
 
 

@@ -67,7 +67,8 @@ class RecordedSettings:
     @cached_property
     def _kind(self) -> type[Config] | None:
         with suppress(AdvsearchError, KeyError):
-            return get_experiment(str(self.values.get("command") or "")).settings
+            config: type[Config] = get_experiment(str(self.values.get("command") or "")).settings
+            return config
         return None
 
     @cached_property
@@ -156,9 +157,10 @@ def noted_settings(folder: Path, result: results.Result) -> Mapping[str, Mapping
     hook = get_experiment(result.command).noted_settings
     if hook is None:
         return None
+    noted: Mapping[str, Mapping[str, Mapping[str, Any]]] = {}
     with suppress(AdvsearchError):
-        return hook(folder, result)
-    return {}
+        noted = hook(folder, result)
+    return noted
 
 
 def stated(recorded: Iterable[RecordedSettings], name: str, otherwise: str = "") -> str:

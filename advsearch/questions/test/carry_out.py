@@ -189,9 +189,7 @@ class _SuiteRun:
         command = config.command_line(self.trial.run.path)
         if command is None:
             return None
-        defaults = {
-            power.name: power.default for power in config.powers if power.name not in ("run", "overwrite")
-        }
+        defaults = {power.name: power.default for power in config.powers if power.name not in ("run", "overwrite")}
         without = [f"{name}={json.dumps(default)}" for name, default in defaults.items()]
         seed = ["fresh=false", f"seed={self.trial.suite.seed}"] if config.fresh else []
         return f"{command} {shlex.join([*changes, *seed, *without])}".rstrip()
