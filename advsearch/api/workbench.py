@@ -85,10 +85,10 @@ from advsearch.questions.sweep.carry_out import scenes_of as scenes_of
 from advsearch.questions.sweep.display import surface_sentences as surface_sentences
 from advsearch.questions.sweep.predicting import prepare_surface_light as prepare_surface_light
 from advsearch.questions.sweep.stored import StoredSweep as StoredSweep
-from advsearch.questions.sweep.summary import AxisValue as AxisValue
 from advsearch.questions.sweep.summary import SweepSummary as SweepSummary
 from advsearch.registry import get_experiment as get_experiment
 from advsearch.registry import imported
+from advsearch.runs.results import AxisValue as AxisValue
 from advsearch.runs.store import Row as Row
 from advsearch.runs.summary import read_configuration as read_configuration
 from advsearch.runs.tables import units_of as units_of
