@@ -26,9 +26,9 @@ threads.configure()
 from advsearch.engine.gradients import interior_point, smooth_loss  # noqa: E402
 from advsearch.questions.attack.carry_out import problem_from_config  # noqa: E402
 from advsearch.questions.precision import precision  # noqa: E402
-from advsearch.questions.precision.benches import GradientBench, PictureBench, TimeBudget, gradient_parts  # noqa: E402
+from advsearch.questions.precision.benches import GradientBench, PictureBench, TimeBudget, list_gradient_parts  # noqa: E402
 from advsearch.questions.precision.result import PrecisionConfig, Recommended  # noqa: E402
-from advsearch.questions.precision.rule import ReferenceValue, SampleSetting, point_of  # noqa: E402
+from advsearch.questions.precision.rule import ReferenceValue, SampleSetting, summarize_samples  # noqa: E402
 
 SCENES = ("bowl/kitchen", "bottle/noon", "ball/studio")
 CONTROL = "environment"
@@ -71,8 +71,8 @@ def intervals() -> int:
             for _ in range(TRIES):
                 samples, true = simulated(noise, repeats, rng)
                 setting = SampleSetting("picture", noise, 4, 4.0)
-                point = point_of(setting, samples)
-                bare = point_of(setting, [{**numbers, "fourth": math.nan} for numbers in samples])
+                point = summarize_samples(setting, samples)
+                bare = summarize_samples(setting, [{**numbers, "fourth": math.nan} for numbers in samples])
                 assert bare.interval is not None
                 all_covered.append(bare.interval[0] <= true <= bare.interval[1])
                 if not point.heavy_tailed:
@@ -100,7 +100,7 @@ def simulated(noise: str, repeats: int, rng: np.random.Generator) -> tuple[list[
         found = found + (rng.random(size) < share) * rng.exponential(1.0, size) * math.sqrt(0.5 / share)
         variance = 2.0
     reference = ReferenceValue(np.zeros(PIXELS), 0.0, 1.0, 2)
-    return [{**reference.beside(picture), "seconds": 1.0} for picture in found], math.sqrt(PIXELS * variance)
+    return [{**reference.compare(picture), "seconds": 1.0} for picture in found], math.sqrt(PIXELS * variance)
 
 
 def one(scene: str, args: argparse.Namespace) -> bool:
@@ -154,12 +154,12 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
     else:
         renderer = renderer.like(denoiser="none", transfer="linear")
         renderer.plan = renderer.plan.at_a_pixel()
-        part = next(one for one in gradient_parts(renderer.plan.groups, linear=True) if one.name == found.control)
+        part = next(one for one in list_gradient_parts(renderer.plan.groups, linear=True) if one.name == found.control)
         loss = smooth_loss(renderer.formation.resolution, config.seed)
         bench = GradientBench(renderer, loss, interior_point(renderer), part)
     bench.refer(budget, SEED, lambda: None)
     samples = [bench.measure(setting, SEED + number)[found.quantity] for number in range(REPEATS)]
-    point = point_of(setting, samples, floor=bench.floor(setting, found.quantity))
+    point = summarize_samples(setting, samples, floor=bench.floor(setting, found.quantity))
     return point.rms, point.known
 
 

@@ -28,11 +28,11 @@ from advsearch.questions.precision.benches import (
     MOST_PARTS,
     GradientBench,
     TimeBudget,
-    gather,
-    gradient_parts,
-    in_rounds,
+    list_gradient_parts,
+    measure_in_rounds,
+    take_reference_parts,
 )
-from advsearch.questions.precision.carry_out import Measurement, recommended
+from advsearch.questions.precision.carry_out import Measurement, recommend_settings
 from advsearch.questions.precision.result import (
     SAMPLERS,
     WARM_UP,
@@ -40,24 +40,24 @@ from advsearch.questions.precision.result import (
     PrecisionPoint,
     PrecisionResult,
     Recommended,
-    cautions,
-    headline,
+    list_cautions,
+    make_headline,
     precision_figures,
 )
 from advsearch.questions.precision.rule import (
     FURTHEST,
     ReferenceValue,
     SampleSetting,
-    confirmed,
-    exactly,
+    confirm_recommendation,
+    describe_disagreement,
+    estimate_reference,
     fit_line,
-    heavy_tailed,
-    levels_off,
-    point_of,
-    reaching,
-    reference_of,
-    typical,
-    warning_of,
+    has_leveled_off,
+    is_heavy_tailed,
+    median_time,
+    recommend_count,
+    round_up_exactly,
+    summarize_samples,
 )
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_result
@@ -104,19 +104,19 @@ def measured(
     points = []
     for count in COUNTS_TRIED:
         values = [noisy(count, 100 * count + k, bias, power) for k in range(8)]
-        samples = [{**reference.beside(value), "seconds": 1e-3 * count} for value in values]
-        points.append(point_of(setting(count, estimator), samples, floor=reference.error))
+        samples = [{**reference.compare(value), "seconds": 1e-3 * count} for value in values]
+        points.append(summarize_samples(setting(count, estimator), samples, floor=reference.error))
     return points
 
 
 def exact() -> ReferenceValue:
     """A reference whose own error is far below everything measured."""
-    return reference_of([noisy(10**8, seed) for seed in (1, 2)])
+    return estimate_reference([noisy(10**8, seed) for seed in (1, 2)])
 
 
 def rough(samples: int) -> ReferenceValue:
     """A reference from four parts that are not much better than what is measured."""
-    return reference_of([noisy(samples, seed) for seed in range(4)])
+    return estimate_reference([noisy(samples, seed) for seed in range(4)])
 
 
 # ---- references -----------------------------------------------------------------------------------------------------
@@ -131,30 +131,30 @@ def test_the_error_of_a_reference_is_what_its_parts_scatter_by() -> None:
 
 def test_two_halves_give_half_their_difference() -> None:
     one, other = np.array([1.0, 2.0]), np.array([1.4, 2.3])
-    assert reference_of([one, other]).error * reference_of([one, other]).size == pytest.approx(0.25)
+    assert estimate_reference([one, other]).error * estimate_reference([one, other]).size == pytest.approx(0.25)
 
 
 def test_a_reference_through_a_bend_knows_of_scatter_and_bias() -> None:
     generator = np.random.default_rng(0)
     parts = [1.0 + 0.1 * generator.standard_normal(1) for _ in range(16)]
-    found = reference_of(parts, np.exp)
+    found = estimate_reference(parts, np.exp)
     assert found.error * found.size == pytest.approx(math.e * 0.1 / 4.0, rel=0.4)
     error = float(np.std(parts, ddof=1)) / 4.0
-    assert reference_of(parts).error * reference_of(parts).size == pytest.approx(error, rel=1e-9)
-    assert reference_of(parts, bias=1.0).error > 1.0 / 1.2
+    assert estimate_reference(parts).error * estimate_reference(parts).size == pytest.approx(error, rel=1e-9)
+    assert estimate_reference(parts, bias=1.0).error > 1.0 / 1.2
 
 
 def test_one_part_is_no_reference() -> None:
     with pytest.raises(ValueError, match="two independent parts, got 1"):
-        reference_of([TRUTH])
+        estimate_reference([TRUTH])
 
 
 def test_cosine_and_error_of_a_vector() -> None:
-    one = reference_of([np.array([3.0, 4.0])] * 2)
-    assert one.beside(np.array([3.0, 4.5]))["error"] == pytest.approx(0.1)
-    assert one.beside(np.array([4.0, -3.0]))["cosine"] == pytest.approx(0.0)
-    assert math.isnan(one.beside(np.zeros(2))["cosine"])
-    assert reference_of([np.zeros(2)] * 2).beside(np.ones(2))["error"] == math.inf
+    one = estimate_reference([np.array([3.0, 4.0])] * 2)
+    assert one.compare(np.array([3.0, 4.5]))["error"] == pytest.approx(0.1)
+    assert one.compare(np.array([4.0, -3.0]))["cosine"] == pytest.approx(0.0)
+    assert math.isnan(one.compare(np.zeros(2))["cosine"])
+    assert estimate_reference([np.zeros(2)] * 2).compare(np.ones(2))["error"] == math.inf
 
 
 # ---- points ---------------------------------------------------------------------------------------------------------
@@ -179,8 +179,8 @@ def test_no_point_below_the_reference_is_called_known() -> None:
 
 def test_seconds_leave_the_warm_up_out() -> None:
     times = [9.0] * WARM_UP + [1.0, 3.0, 2.0]
-    assert typical(times) == 2.0
-    assert typical([9.0, 4.0]) == 4.0
+    assert median_time(times) == 2.0
+    assert median_time([9.0, 4.0]) == 4.0
 
 
 def tails(kind: str, seed: int, repeats: int = 8) -> tuple[list[dict[str, float]], float]:
@@ -192,21 +192,21 @@ def tails(kind: str, seed: int, repeats: int = 8) -> tuple[list[dict[str, float]
         noise += (rng.random(noise.shape) < 3.0 / 4096) * rng.exponential(100.0, noise.shape)
     true = math.sqrt(4096 * (1.0 + (3.0 / 4096 * 2.0 * 100.0**2 if kind == "fireflies" else 0.0)))
     reference = ReferenceValue(np.zeros(4096), 0.0, 1.0, 2)
-    return [{**reference.beside(one), "seconds": 1.0} for one in noise], true
+    return [{**reference.compare(one), "seconds": 1.0} for one in noise], true
 
 
 def test_an_error_that_a_few_pixels_hold_has_no_interval_and_any_other_has_one_that_holds() -> None:
     covered = 0
     for seed in range(100):
         numbers, true = tails("normal", seed)
-        point = point_of(setting(4), numbers)
+        point = summarize_samples(setting(4), numbers)
         assert not point.heavy_tailed and point.interval is not None
         covered += point.interval[0] <= true <= point.interval[1]
         numbers, _ = tails("fireflies", seed)
-        point = point_of(setting(4), numbers)
+        point = summarize_samples(setting(4), numbers)
         assert point.heavy_tailed and point.interval is None
     assert covered >= 90
-    assert not heavy_tailed([{"error": 1.0, "fourth": math.nan}]), "few numbers say nothing"
+    assert not is_heavy_tailed([{"error": 1.0, "fourth": math.nan}]), "few numbers say nothing"
 
 
 # ---- slopes ---------------------------------------------------------------------------------------------------------
@@ -218,7 +218,7 @@ def test_independent_noise_has_slope_minus_a_half() -> None:
     assert line is not None and line.slope == pytest.approx(-0.5, abs=TOLERANCE)
     assert line.interval[0] < -0.5 < line.interval[1] or abs(line.slope + 0.5) < 0.02
     assert line.agrees is True and line.points == 5
-    assert warning_of(line, points) is None
+    assert describe_disagreement(line, points) is None
 
 
 def test_the_slope_survives_a_reference_that_is_hardly_better() -> None:
@@ -231,8 +231,8 @@ def test_a_bias_levels_off_and_is_warned_of() -> None:
     points = measured(exact(), bias=0.1)
     line = fit_line(points, or_steeper=False)
     assert line is not None and line.slope > -0.35 and line.agrees is False
-    assert levels_off(points) and not levels_off(measured(exact()))
-    assert "levels off" in str(warning_of(line, points))
+    assert has_leveled_off(points) and not has_leveled_off(measured(exact()))
+    assert "levels off" in str(describe_disagreement(line, points))
 
 
 def test_a_steeper_slope_agrees_only_where_theory_allows_it() -> None:
@@ -264,7 +264,7 @@ def reached(found: Recommended | None) -> tuple[Recommended, int, float]:
 
 @pytest.mark.parametrize("goal", [0.3, 0.1, 0.05])
 def test_a_recommended_count_reaches_its_goal(goal: float) -> None:
-    found, spp, _ = reached(reaching(measured(exact()), goal))
+    found, spp, _ = reached(recommend_count(measured(exact()), goal))
     assert found.basis in ("interpolated", "fitted")
     assert error_at(spp) == pytest.approx(goal, rel=0.1)
     assert found.seconds == pytest.approx(1e-3 * spp, rel=0.01)
@@ -284,17 +284,17 @@ def test_a_line_that_explains_all_points_overrules_a_lucky_one() -> None:
 
     true = [point(spp, spp**-0.5) for spp in (4, 16, 64, 256)]
     lucky = [point(8, 0.7 * 8**-0.5), *true]
-    found = reaching(lucky, 0.1)
+    found = recommend_count(lucky, 0.1)
     assert found is not None and found.basis == "fitted" and found.spp == pytest.approx(100, rel=0.15)
-    assert reaching([point_at(one.spp, max(one.rms, 0.2), (0.19, 0.21)) for one in true], 0.1) is None
+    assert recommend_count([point_at(one.spp, max(one.rms, 0.2), (0.19, 0.21)) for one in true], 0.1) is None
 
 
 @pytest.mark.parametrize(("error", "times", "promised"), [(0.08, 1, 0.08), (0.2, 4, 0.1), (10.0, FURTHEST, 2.5)])
 def test_new_measurements_of_a_recommended_setting_are_what_is_promised(
     error: float, times: int, promised: float
 ) -> None:
-    one, spp, _ = reached(reaching(measured(exact()), 0.1))
-    found = confirmed(one, point_at(spp, error, repeats=12).model_copy(update={"seconds": 0.5}))
+    one, spp, _ = reached(recommend_count(measured(exact()), 0.1))
+    found = confirm_recommendation(one, point_at(spp, error, repeats=12).model_copy(update={"seconds": 0.5}))
     assert (found.basis, found.repeats, found.spp) == ("confirmed", 12, times * spp)
     assert found.error == pytest.approx(promised) and found.seconds == pytest.approx(0.5 * times)
 
@@ -306,14 +306,14 @@ def test_what_is_chosen_among_noisy_points_looks_better_than_it_is_until_it_is_m
     def point(estimator: str, spp: int, repeats: int) -> PrecisionPoint:
         squares = rng.normal(0.0, spp**-0.5, repeats) ** 2
         samples = [{"error": math.sqrt(square), "seconds": 1e-3 * spp} for square in squares]
-        return point_of(setting(spp, estimator), samples)
+        return summarize_samples(setting(spp, estimator), samples)
 
     before, after = [], []
     for _ in range(200):
         points = [point(name, spp, 4) for name in "abc" for spp in (4, 16, 64, 256)]
-        one, spp, error = reached(recommended(points, [], 0.1, exactly)[0])
+        one, spp, error = reached(recommend_settings(points, [], 0.1, round_up_exactly)[0])
         before.append(math.log(spp**-0.5 / error))
-        _, spp, error = reached(confirmed(one, point(str(one.estimator), spp, 24)))
+        _, spp, error = reached(confirm_recommendation(one, point(str(one.estimator), spp, 24)))
         after.append(math.log(spp**-0.5 / error))
     assert np.mean(before) > 0.2
     assert abs(np.mean(after)) < 0.05 and np.quantile(np.abs(after), 0.95) < math.log(1.5)
@@ -321,36 +321,38 @@ def test_what_is_chosen_among_noisy_points_looks_better_than_it_is_until_it_is_m
 
 def test_where_points_are_too_few_for_a_line_theory_says_how_it_goes_on() -> None:
     point = measured(exact())[1]  # 16 samples
-    assert reaching([point], 0.5 * point.rms) is None
-    found, spp, _ = reached(reaching([point], 0.5 * point.rms, or_steeper=False))
+    assert recommend_count([point], 0.5 * point.rms) is None
+    found, spp, _ = reached(recommend_count([point], 0.5 * point.rms, or_steeper=False))
     assert found.basis == "extrapolated" and spp == 64 and found.seconds == pytest.approx(0.064)
-    assert reaching([point], point.rms / 5.0, or_steeper=False) is None, "too far"
+    assert recommend_count([point], point.rms / 5.0, or_steeper=False) is None, "too far"
 
 
 def test_beyond_the_last_point_it_says_so_and_not_too_far() -> None:
     points = measured(exact())
-    found, spp, _ = reached(reaching(points, 0.5 * points[-1].rms))
+    found, spp, _ = reached(recommend_count(points, 0.5 * points[-1].rms))
     assert found.basis == "extrapolated"
     assert error_at(spp) == pytest.approx(found.goal, rel=0.15)
-    assert reaching(points, points[-1].rms / FURTHEST) is None
+    assert recommend_count(points, points[-1].rms / FURTHEST) is None
 
 
 def test_what_levels_off_is_never_recommended_below_its_level() -> None:
     biased = measured(exact(), bias=0.1, estimator="biased")
-    assert reaching(biased, 0.05) is None
+    assert recommend_count(biased, 0.05) is None
     slow = [point.model_copy(update={"seconds": 1.0 + point.seconds}) for point in measured(exact())]
-    (cheap,), (good,) = (recommended([*biased, *slow], [], goal, exactly) for goal in (0.2, 0.05))
+    (cheap,), (good,) = (recommend_settings([*biased, *slow], [], goal, round_up_exactly) for goal in (0.2, 0.05))
     assert (cheap.estimator, good.estimator) == ("biased", "independent")
 
 
 def test_a_count_is_rounded_to_what_the_sampler_takes() -> None:
-    _, spp, error = reached(reaching(measured(exact()), 0.1, lambda point, samples: next_count("ldsampler", samples)))
+    _, spp, error = reached(
+        recommend_count(measured(exact()), 0.1, lambda point, samples: next_count("ldsampler", samples))
+    )
     assert math.log(spp, 4) == pytest.approx(round(math.log(spp, 4)))
     assert error <= 0.1
 
 
 def test_the_cheapest_that_is_good_enough_is_taken_as_it_is() -> None:
-    found = reaching(measured(exact()), 10.0)
+    found = recommend_count(measured(exact()), 10.0)
     assert found is not None and (found.spp, found.basis) == (4, "measured")
 
 
@@ -374,7 +376,7 @@ def test_rounds_are_interleaved_cheapest_first_with_a_seed_each() -> None:
     clock, order = Clock(), []
     settings = [setting(count, name) for name in ("a", "b") for count in (16, 4)]
     budget, note = TimeBudget(100.0, clock), lambda one: order.append(one.cost)
-    measured = in_rounds(settings, timed(clock), budget, rounds=3, seed=0, on_done=note)
+    measured = measure_in_rounds(settings, timed(clock), budget, rounds=3, seed=0, on_done=note)
     assert order == [4.0] * 4 + [16.0] * 4 + [4.0, 4.0, 16.0, 16.0] * 2
     given = [seed for taken in measured.results.values() for seed, _ in taken]
     assert len(set(given)) == len(given) == 16 and measured.left_out == []
@@ -385,7 +387,7 @@ def test_rounds_are_interleaved_cheapest_first_with_a_seed_each() -> None:
 def test_a_budget_is_kept_and_what_was_left_out_is_said(seconds: float, cold: float) -> None:
     clock = Clock()
     settings = [setting(count, name) for name in ("a", "b", "c") for count in COUNTS_TRIED]
-    measured = in_rounds(settings, timed(clock, cold=cold), TimeBudget(seconds, clock), rounds=50, seed=0)
+    measured = measure_in_rounds(settings, timed(clock, cold=cold), TimeBudget(seconds, clock), rounds=50, seed=0)
     assert clock.now <= seconds + 3 * cold
     assert {*measured.left_out} | {*measured.results} == {*settings}
     if measured.left_out and cold == 0.0:
@@ -396,18 +398,20 @@ def test_a_budget_is_kept_and_what_was_left_out_is_said(seconds: float, cold: fl
 def test_what_compiles_first_is_never_taken_for_the_time_of_a_setting() -> None:
     """On a busy machine the first call may use up all of the time; there is another one all the same."""
     clock = Clock()
-    measured = in_rounds([setting(4), setting(16)], timed(clock, cold=40.0), TimeBudget(10.0, clock), rounds=8, seed=0)
+    measured = measure_in_rounds(
+        [setting(4), setting(16)], timed(clock, cold=40.0), TimeBudget(10.0, clock), rounds=8, seed=0
+    )
     (taken,) = measured.results.values()
-    assert typical([seconds for _, seconds in taken]) == pytest.approx(0.004) and measured.left_out == [setting(16)]
+    assert median_time([seconds for _, seconds in taken]) == pytest.approx(0.004) and measured.left_out == [setting(16)]
 
 
 def test_a_machine_that_is_busy_and_pixels_that_hold_the_error_are_said() -> None:
     def point(wall: float, heavy: bool = False) -> PrecisionPoint:
         return point_at(1000, 0.1).model_copy(update={"wall_seconds": wall, "heavy_tailed": heavy})
 
-    assert cautions([point(0.6), point(1.0), point(9.0)]) == [] == cautions([])
-    assert "busy" in cautions([point(0.6), point(2.5), point(9.0)])[0]
-    assert "independent: a few pixels hold" in cautions([point(0.6, heavy=True)])[0]
+    assert list_cautions([point(0.6), point(1.0), point(9.0)]) == [] == list_cautions([])
+    assert "busy" in list_cautions([point(0.6), point(2.5), point(9.0)])[0]
+    assert "independent: a few pixels hold" in list_cautions([point(0.6, heavy=True)])[0]
 
 
 def test_a_part_of_a_budget_is_a_budget() -> None:
@@ -428,7 +432,7 @@ def test_a_reference_has_two_parts_whatever_they_take_and_stops_in_time() -> Non
         return np.array([float(seed)])
 
     for seconds, count in ((0.1, 2), (0.0, 2), (5.5, 5), (1e9, MOST_PARTS)):
-        parts = gather(part, TimeBudget(seconds, clock), lambda: None, seed=0)
+        parts = take_reference_parts(part, TimeBudget(seconds, clock), lambda: None, seed=0)
         assert len(parts) == count == len({float(one[0]) for one in parts})
 
 
@@ -475,21 +479,21 @@ def group(parameter: str, *valid: str) -> Group:
 
 
 def test_parts_of_a_control_with_other_estimators_have_names_of_their_own() -> None:
-    parts = gradient_parts(
+    parts = list_gradient_parts(
         [group("x", "differences"), group("power", "adjoint", "differences"), group("kind")], linear=True
     )
     assert [part.name for part in parts] == ["light.x", "light.power"]
     assert [part.estimators for part in parts] == [("differences",), ("adjoint", "differences")]
     secant = [group("x", "secant", "differences")]
-    assert gradient_parts(secant, linear=True)[0].estimators == ("differences",)
-    assert "secant" in gradient_parts(secant, linear=False)[0].estimators
+    assert list_gradient_parts(secant, linear=True)[0].estimators == ("differences",)
+    assert "secant" in list_gradient_parts(secant, linear=False)[0].estimators
 
 
 def test_an_adjoint_is_compared_with_a_reference_by_an_adjoint_that_differences_confirm() -> None:
     renderer = load_scene("mug").renderer({"texture": {"resolution": 8}}, resolution=24, denoise="none")
     renderer = renderer.like(transfer="linear")
     renderer.plan = renderer.plan.at_a_pixel()
-    (part,) = gradient_parts(renderer.plan.groups, linear=True)
+    (part,) = list_gradient_parts(renderer.plan.groups, linear=True)
     bench = GradientBench(renderer, smooth_loss((24, 24)), renderer.start, part)
     (row,) = bench.refer(TimeBudget(1.0), 0, lambda: None)
     assert (row.reference, row.control, row.quantity) == ("adjoint", "texture", "gradient") and row.error < 0.5
@@ -550,7 +554,7 @@ def test_a_tiny_scene_from_end_to_end(
         assert independent["slope"] == pytest.approx(-0.5, abs=0.15)
     result = PrecisionResult.of(report)
     assert precision_text(result).count("images/precision.") == 2 and precision_text(result).startswith(
-        headline(result)
+        make_headline(result)
     )
     for one in report["points"]:
         assert one["wall_seconds"] > 0.0

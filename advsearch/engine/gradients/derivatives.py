@@ -51,7 +51,6 @@ class Reference(NamedTuple):
     value: float
     noise: float
     steps: tuple[float, float]
-    renders: int
     factor: float = 1.0
 
 
@@ -185,7 +184,6 @@ def measure_reference(
     several `factors`, each gets the smaller number of seeds, both steps so many times wider, until one is sure enough;
     if none is, the one with the least noise goes on.
     """
-    renders_before = bench.renderer.renders
     pairs: dict[float, list[tuple[float, float]]] = {factor: [] for factor in factors}
 
     def measure(factor: float, count: int) -> tuple[Reference, float]:
@@ -201,7 +199,7 @@ def measure_reference(
         if len(extrapolated) > 1:
             error = statistics.stdev(extrapolated) / math.sqrt(len(extrapolated))
         noise_of_both = math.hypot(error, 0.25 * (coarse_mean - fine_mean))
-        return Reference(statistics.fmean(extrapolated), noise_of_both, (coarse_mean, fine_mean), 0, factor), error
+        return Reference(statistics.fmean(extrapolated), noise_of_both, (coarse_mean, fine_mean), factor), error
 
     measured = dict[float, tuple[Reference, float]]()
     for factor in factors:
@@ -213,7 +211,7 @@ def measure_reference(
         reference, error = measured[best]
         while error > SURE * abs(reference.value) and len(pairs[best]) < repeats[1]:
             reference, error = measure(best, len(pairs[best]) + 1)
-    return reference._replace(renders=bench.renderer.renders - renders_before)
+    return reference
 
 
 def _difference(bench: Bench, probe: Probe, step: float, seed: int) -> float:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch.extend import gradients, seeds
 from advsearch.questions.precision.result import PrecisionReference
-from advsearch.questions.precision.rule import Array, Numbers, ReferenceValue, SampleSetting, reference_of
+from advsearch.questions.precision.rule import Array, Numbers, ReferenceValue, SampleSetting, estimate_reference
 
 LEAST, COLD = 5, 2  # calls of a setting that have to fit into the budget for it to be begun; the first ones take longer
 CLAIM = 0.25  # share of the time left that one setting may lay claim to
@@ -46,25 +46,29 @@ class MeasuredRounds:
     walls: dict[SampleSetting, list[float]] = field(default_factory=dict)
     left_out: list[SampleSetting] = field(default_factory=list)
 
-    def call_takes(self, setting: SampleSetting) -> float:
+    def estimate_call_seconds(self, setting: SampleSetting) -> float:
         """Seconds of a call but the first ones: as the setting's own, else in proportion to its line's dearest setting,
         else at the highest rate of any line; 0 where nothing is known."""
         if setting in self.walls:
             return statistics.median((self.walls[setting][COLD:] or self.walls[setting][-1:])[-3:])
         dearest = {known.line: known for known in sorted(self.walls, key=lambda each: each.cost)}
-        rates = {line: self.call_takes(known) / known.cost for line, known in dearest.items()}
+        rates = {line: self.estimate_call_seconds(known) / known.cost for line, known in dearest.items()}
         return setting.cost * rates.get(setting.line, max(rates.values(), default=0.0))
 
-    def needs(self, setting: SampleSetting, left: float) -> float:
+    def estimate_needed_seconds(self, setting: SampleSetting, left: float) -> float:
         """Seconds that a new setting needs for its calls, with what those begun still need for as many. One of these
         that needs more than a share `CLAIM` of what is left turned out too dear, and waits until the end."""
-        cold = [sum(taken[:COLD]) - COLD * self.call_takes(at) for at, taken in self.walls.items() if len(taken) > COLD]
-        owed = [max(0, LEAST - len(taken)) * self.call_takes(at) for at, taken in self.walls.items()]
+        cold = [
+            sum(taken[:COLD]) - COLD * self.estimate_call_seconds(at)
+            for at, taken in self.walls.items()
+            if len(taken) > COLD
+        ]
+        owed = [max(0, LEAST - len(taken)) * self.estimate_call_seconds(at) for at, taken in self.walls.items()]
         first = max(0.0, statistics.median(cold)) if cold else 0.0
-        return first + LEAST * self.call_takes(setting) + sum(need for need in owed if need <= CLAIM * left)
+        return first + LEAST * self.estimate_call_seconds(setting) + sum(need for need in owed if need <= CLAIM * left)
 
 
-def in_rounds(
+def measure_in_rounds(
     settings: Iterable[SampleSetting], measure: Callable[[SampleSetting, int], Any], budget: TimeBudget, *,
     rounds: int, seed: int, on_done: Callable[[SampleSetting], None] = lambda setting: None,
 ) -> MeasuredRounds:  # fmt: skip
@@ -86,19 +90,21 @@ def in_rounds(
         on_done(setting)
 
     for setting in sorted(settings, key=lambda each: each.cost):
-        if measured.results and measured.needs(setting, budget.left) > budget.left:
+        if measured.results and measured.estimate_needed_seconds(setting, budget.left) > budget.left:
             measured.left_out.append(setting)
         else:
             call(setting)
             call(setting)
     for _ in range(1, rounds):
         for setting in measured.results:
-            if measured.call_takes(setting) <= budget.left:
+            if measured.estimate_call_seconds(setting) <= budget.left:
                 call(setting)
     return measured
 
 
-def gather(part: Callable[[int], Part], budget: TimeBudget, on_done: Callable[[], None], seed: int) -> list[Part]:
+def take_reference_parts(
+    part: Callable[[int], Part], budget: TimeBudget, on_done: Callable[[], None], seed: int
+) -> list[Part]:
     """Return independent parts of a reference, each from a seed of its own, as many as fit into a budget; at least two,
     whatever they take: without these, nothing is known about the error."""
     parts: list[Part] = []
@@ -111,7 +117,7 @@ def gather(part: Callable[[int], Part], budget: TimeBudget, on_done: Callable[[]
     return parts
 
 
-def part_samples(
+def choose_part_samples(
     call: Callable[[int], object], seconds: float, *, parts: int = 4, counts: Sequence[int] = (16, 64, 256, 1024)
 ) -> int:
     """Return the largest of some rising sample counts of which `parts` calls fit into some seconds; the least if none
@@ -123,7 +129,7 @@ def part_samples(
     return max((count for count in counts if parts * count * rate <= seconds), default=counts[0])
 
 
-def timed(take: Callable[[], Part]) -> tuple[Part, dict[str, float]]:
+def measure_time(take: Callable[[], Part]) -> tuple[Part, dict[str, float]]:
     processor, wall = time.process_time(), time.perf_counter()
     taken = take()
     return taken, {"seconds": time.process_time() - processor, "wall_seconds": time.perf_counter() - wall}
@@ -153,11 +159,11 @@ class PictureBench:
         self._references: dict[tuple[str, str], ReferenceValue] = {}
         scenes = {name: renderer.scene.like(sampler=name) for name in {*samplers, REFERENCE_SAMPLER}}
         self._renderers = {
-            line: renderer.like(scenes[line.removesuffix(OIDN)], denoiser=denoiser_of(line))
+            line: renderer.like(scenes[line.removesuffix(OIDN)], denoiser=get_denoiser(line))
             for line in {*self._lines, REFERENCE_SAMPLER, REFERENCE_SAMPLER + OIDN}
         }
         self.settings = [
-            SampleSetting("picture", line, count, count * (1.0 if line in FIRST else LATER), family=denoiser_of(line))
+            SampleSetting("picture", line, count, count * (1.0 if line in FIRST else LATER), family=get_denoiser(line))
             for line in self._lines
             for count in COUNTS.get(line, (4, 16, 64, 256))
         ]
@@ -169,14 +175,16 @@ class PictureBench:
             size = (*self._formation.resolution, 3)
             return self._picture(torch.from_numpy(mean).to(torch.float32).reshape(size))
 
-        families, rows = list(dict.fromkeys(map(denoiser_of, self._lines))), []
+        families, rows = list(dict.fromkeys(map(get_denoiser, self._lines))), []
         for number, family in enumerate(families):
             share, name = budget.share(1.0 / (len(families) - number)), REFERENCE_SAMPLER + OIDN * (family == "oidn")
             take = partial(self._radiance, name)
-            spp = part_samples(partial(take, 0), share.left)
-            parts = [flat(radiance) for radiance in gather(partial(take, spp=spp), share, on_done, seed)]
-            picture = reference_of(parts, lambda mean: flat(shown(mean)))
-            margin = reference_of(parts, lambda mean: np.array([self._margin(shown(mean))]))
+            spp = choose_part_samples(partial(take, 0), share.left)
+            parts = [
+                flatten(radiance) for radiance in take_reference_parts(partial(take, spp=spp), share, on_done, seed)
+            ]
+            picture = estimate_reference(parts, lambda mean: flatten(shown(mean)))
+            margin = estimate_reference(parts, lambda mean: np.array([self._margin(shown(mean))]))
             self._references["margin", family] = margin
             self._references["picture", family] = self._references.get(("picture", "none"), picture)
             rows += [_row("picture", name, picture, spp)] if family == "none" else []
@@ -188,10 +196,10 @@ class PictureBench:
 
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
         """Make one picture; return how it and the margin compare, and the times of rendering and denoising."""
-        radiance, times = timed(partial(self._radiance, setting.estimator, seed, setting.spp))
+        radiance, times = measure_time(partial(self._radiance, setting.estimator, seed, setting.spp))
         picture = self._picture(radiance)
-        values = {"picture": flat(picture), "margin": np.array([self._margin(picture)])}
-        beside = {name: self._references[name, setting.family].beside(value) for name, value in values.items()}
+        values = {"picture": flatten(picture), "margin": np.array([self._margin(picture)])}
+        beside = {name: self._references[name, setting.family].compare(value) for name, value in values.items()}
         return {name: {**numbers, **times} for name, numbers in beside.items()}
 
     def _radiance(self, line: str, seed: int, spp: int) -> Tensor:
@@ -203,7 +211,7 @@ class PictureBench:
             return self._space.picture(self._u, self._formation.display(radiance))
 
 
-def denoiser_of(line: str) -> str:
+def get_denoiser(line: str) -> str:
     return "oidn" if line.endswith(OIDN) else "none"
 
 
@@ -229,14 +237,14 @@ class GradientPart:
         return {group.name for group in self.groups}
 
     def of(self, gradient: Tensor) -> Array:
-        return flat(torch.cat([gradient[group.coordinates] for group in self.groups]))
+        return flatten(torch.cat([gradient[group.coordinates] for group in self.groups]))
 
     def count_renders(self, estimator: str) -> int:
         """Return the primal renders that one gradient by an estimator takes, beside the image itself."""
         return sum(replace(group, estimator=estimator).renders for group in self.groups)
 
 
-def gradient_parts(groups: Sequence[gradients.Group], *, linear: bool) -> list[GradientPart]:
+def list_gradient_parts(groups: Sequence[gradients.Group], *, linear: bool) -> list[GradientPart]:
     """Return the parts of a space with the estimators that are valid for them. Of a linear loss, differences of the
     loss are those of the picture, and left out."""
     sets = gradients.planning.comparable_sets(group for group in groups if group.valid)
@@ -275,14 +283,16 @@ class GradientBench:
         """Take the reference within a budget."""
         if self._by_differences:
             take = partial(self._take_derivatives, self._list_probes())
-            spp = part_samples(partial(take, 0), budget.left, parts=3, counts=(16, 64, 256))
-            parts = gather(partial(take, spp=spp), budget, on_done, seed)
+            spp = choose_part_samples(partial(take, 0), budget.left, parts=3, counts=(16, 64, 256))
+            parts = take_reference_parts(partial(take, spp=spp), budget, on_done, seed)
             bias = float(np.linalg.norm(np.mean([disagreement for _, disagreement in parts], axis=0))) / 4.0
-            self.reference = reference_of([derivatives for derivatives, _ in parts], bias=bias)
+            self.reference = estimate_reference([derivatives for derivatives, _ in parts], bias=bias)
         else:
             take_gradient = partial(self._take_gradient, self._exact, self._reference_estimator)
-            spp = part_samples(partial(take_gradient, 0), budget.left)
-            self.reference = reference_of(gather(partial(take_gradient, spp=spp), budget, on_done, seed))
+            spp = choose_part_samples(partial(take_gradient, 0), budget.left)
+            self.reference = estimate_reference(
+                take_reference_parts(partial(take_gradient, spp=spp), budget, on_done, seed)
+            )
         return [_row("gradient", self._reference_estimator, self.reference, spp, self.part.name)]
 
     def _list_probes(self) -> list[gradients.Probe]:
@@ -312,8 +322,10 @@ class GradientBench:
     def measure(self, setting: SampleSetting, seed: int) -> dict[str, Numbers]:
         """Take one gradient; return how it compares, and its times, the picture itself included."""
         assert self.reference is not None
-        gradient, times = timed(partial(self._take_gradient, self._renderer, setting.estimator, seed, setting.spp))
-        return {"gradient": {**self.reference.beside(gradient), **times}}
+        gradient, times = measure_time(
+            partial(self._take_gradient, self._renderer, setting.estimator, seed, setting.spp)
+        )
+        return {"gradient": {**self.reference.compare(gradient), **times}}
 
     def bias(self, seed: int) -> str | None:
         """Check a reference by an adjoint against differences along one direction; a sentence if it is biased."""
@@ -346,6 +358,6 @@ def _row(quantity: str, name: str, value: ReferenceValue, spp: int, control: str
     )  # fmt: skip
 
 
-def flat(values: Tensor) -> Array:
+def flatten(values: Tensor) -> Array:
     numbers: Array = values.detach().to(torch.float64).reshape(-1).numpy().copy()
     return numbers

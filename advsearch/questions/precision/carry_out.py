@@ -19,8 +19,8 @@ from advsearch.questions.precision.benches import (
     GradientPart,
     PictureBench,
     TimeBudget,
-    gradient_parts,
-    in_rounds,
+    list_gradient_parts,
+    measure_in_rounds,
 )
 from advsearch.questions.precision.result import (
     Machine,
@@ -29,10 +29,17 @@ from advsearch.questions.precision.result import (
     PrecisionResult,
     Recommended,
     Sitting,
-    cautions,
+    list_cautions,
     precision_figures,
 )
-from advsearch.questions.precision.rule import RoundUp, confirmed, fit_line, point_of, reaching, warning_of
+from advsearch.questions.precision.rule import (
+    RoundUp,
+    confirm_recommendation,
+    describe_disagreement,
+    fit_line,
+    recommend_count,
+    summarize_samples,
+)
 
 SHARES = {"image": 0.6, "gradient": 0.4}  # of the time, by quantity; what one doesn't use is the others'
 REFERENCE_SHARE = 0.35  # of the time of a quantity, for its reference
@@ -74,19 +81,19 @@ def measure_precision(context: RunContext[PrecisionConfig]) -> PrecisionResult:
 
         points, warnings = join("points"), join("warnings")
         slopes = []
-        for line in lines_of(points).values():
+        for line in group_by_line(points).values():
             slope = fit_line(line, job.or_steeper(line[0]))
             if slope is not None:
                 slopes.append(slope)
-                warnings += filter(None, [warning_of(slope, line)])
+                warnings += filter(None, [describe_disagreement(slope, line)])
         return context.result(
             PrecisionResult, model=problem.model.name, environment=problem.environment,
             depth=problem.renderer.scene.max_depth, loss=config.loss, spp=problem.spp, goal=config.error,
             image_formation=results.Formation.of(problem.renderer.formation),
             machine=Machine(**context.machine, threads=count_threads()), points=points, slopes=slopes,
-            references=join("references"), left_out=join("left_out"), warnings=[*warnings, *cautions(points)],
-            recommendations=recommended(points, join("again"), config.error, job.round_up, job.or_steeper), figures=[],
-            seconds={"budget": config.seconds, "setup": setup_seconds},
+            references=join("references"), left_out=join("left_out"), warnings=[*warnings, *list_cautions(points)],
+            recommendations=recommend_settings(points, join("again"), config.error, job.round_up, job.or_steeper),
+            figures=[], seconds={"budget": config.seconds, "setup": setup_seconds},
         )  # fmt: skip
 
     result = measurements.collect(measure_sittings(), make_result)
@@ -112,7 +119,7 @@ class Measurement:
         if "image" in config.measured_quantities:
             self.sittings.append(("image", SHARES["image"], self._measure_image))
         if "gradient" in config.measured_quantities:
-            parts = gradient_parts(self._renderer.plan.groups, linear=self._is_linear)
+            parts = list_gradient_parts(self._renderer.plan.groups, linear=self._is_linear)
             if not parts:
                 names = ",".join(config.controls)
                 raise InputError(f"`controls` {names}: has no derivative; leave gradient out of `quantities`")
@@ -154,7 +161,7 @@ class Measurement:
         first_share = 1.0 - CONFIRM_SHARE * (1.0 - REFERENCE_SHARE)
         sitting = self._measure_settings(title, bench, budget.share(first_share))
         remark = None
-        chosen = recommended(sitting.points, [], self._config.error, self.round_up, self.or_steeper)[0]
+        chosen = recommend_settings(sitting.points, [], self._config.error, self.round_up, self.or_steeper)[0]
         if budget.left > 0.0:
             remark = bench.bias(self._seed)
         again = self._confirm(title, bench, chosen, budget)
@@ -172,18 +179,20 @@ class Measurement:
         setting = replace(known, spp=chosen.spp, cost=known.cost / known.spp * chosen.spp)
         tick = self._begin_stage(f"{title}: {chosen.estimator} with {chosen.spp} samples again", budget)
         seed = seeds.stream(self._seed, "confirm")
-        measured = in_rounds([setting], bench.measure, budget, rounds=CONFIRM_MOST, seed=seed, on_done=lambda _: tick())
+        measured = measure_in_rounds(
+            [setting], bench.measure, budget, rounds=CONFIRM_MOST, seed=seed, on_done=lambda _: tick()
+        )
         samples = [numbers["gradient"] for numbers in measured.results[setting]]
         if len(samples) < CONFIRM_LEAST:
             return []
-        return [point_of(setting, samples, bench.floor(setting, "gradient"))]
+        return [summarize_samples(setting, samples, bench.floor(setting, "gradient"))]
 
     def _measure_settings(self, title: str, bench: PictureBench | GradientBench, budget: TimeBudget) -> Sitting:
         """Take a bench's references, and measure all of its settings in rounds."""
         start_time, share = time.perf_counter(), budget.share(REFERENCE_SHARE)
         references = bench.refer(share, self._seed, self._begin_stage(f"{title}: references", share))
         tick = self._begin_stage(f"{title}: measuring every setting in rounds", budget)
-        measured = in_rounds(
+        measured = measure_in_rounds(
             bench.settings, bench.measure, budget, rounds=self._config.rounds, seed=self._seed,
             on_done=lambda setting: tick(now=setting.estimator, samples=setting.spp),
         )  # fmt: skip
@@ -191,7 +200,9 @@ class Measurement:
         for setting, samples in measured.results.items():
             for quantity in samples[0]:
                 numbers = [sample[quantity] for sample in samples]
-                points.append(point_of(replace(setting, quantity=quantity), numbers, bench.floor(setting, quantity)))
+                points.append(
+                    summarize_samples(replace(setting, quantity=quantity), numbers, bench.floor(setting, quantity))
+                )
         skipped_counts: dict[str, list[str]] = {}
         for setting in measured.left_out:
             skipped_counts.setdefault(f"{title} by {setting.estimator}", []).append(str(setting.spp))
@@ -211,22 +222,22 @@ class Measurement:
         return tick
 
 
-def lines_of(points: Sequence[PrecisionPoint]) -> dict[tuple[str, ...], list[PrecisionPoint]]:
+def group_by_line(points: Sequence[PrecisionPoint]) -> dict[tuple[str, ...], list[PrecisionPoint]]:
     lines: dict[tuple[str, ...], list[PrecisionPoint]] = {}
     for point in points:
         lines.setdefault((point.quantity, point.control, point.family, point.estimator), []).append(point)
     return {key: sorted(line, key=lambda point: point.spp) for key, line in lines.items()}
 
 
-def recommended(
+def recommend_settings(
     points: Sequence[PrecisionPoint], again: Sequence[PrecisionPoint], goal: float, round_up: RoundUp,
     or_steeper: Callable[[PrecisionPoint], bool | None] = lambda point: None,
 ) -> list[Recommended]:  # fmt: skip
     """Return, for each thing that can be asked for, the setting that reaches a goal soonest, if any is known to; one
     that was measured `again` by what that said."""
     candidates: dict[tuple[str, ...], list[Recommended]] = {}
-    for key, line in lines_of(points).items():
-        candidate = reaching(line, goal, round_up, or_steeper(line[0]))
+    for key, line in group_by_line(points).items():
+        candidate = recommend_count(line, goal, round_up, or_steeper(line[0]))
         candidates.setdefault(key[:3], []).extend([candidate] if candidate else [])
     best = []
     for (quantity, control, family), reached in candidates.items():
@@ -235,7 +246,7 @@ def recommended(
         )
         for point in again:
             if (point.control, point.estimator) == (chosen.control, chosen.estimator) and quantity == "gradient":
-                chosen = confirmed(chosen, point, round_up)
+                chosen = confirm_recommendation(chosen, point, round_up)
         best.append(chosen.model_copy(update={"family": family}))
     return best
 

@@ -202,7 +202,7 @@ READING = (
 )
 
 
-def named(quantity: str, control: str = "") -> str:
+def describe_quantity(quantity: str, control: str = "") -> str:
     return f"the gradient of {control}" if quantity == "gradient" else f"the {quantity}"
 
 
@@ -231,11 +231,13 @@ def shown(result: PrecisionResult) -> ShownResult:
     threads = " and ".join(f"{count} of {name}" for name, count in machine.threads.items())
     stopped = "It was stopped: only a part was measured. " if result.goes_on else ""
     return ShownResult(
-        stopped + headline(result),
+        stopped + make_headline(result),
         [
-            ResultPart("Recommended", [sentence(found, result.goal) for found in result.recommendations]),
+            ResultPart(
+                "Recommended", [describe_recommendation(found, result.goal) for found in result.recommendations]
+            ),
             ResultPart(text=[READING], only="text"),
-            *(_errors(quantity, result.points) for quantity in ("picture", "margin", "gradient")),
+            *(_make_error_table(quantity, result.points) for quantity in ("picture", "margin", "gradient")),
             ResultPart.table(result.slopes, SLOPES, title="Slopes: logarithm of the error against that of samples"),
             ResultPart.table(result.references, REFERENCES, title="References, with their own errors", note=READING),
             ResultPart("Not measured, the time was up", result.left_out),
@@ -249,25 +251,27 @@ def shown(result: PrecisionResult) -> ShownResult:
     )
 
 
-def headline(result: PrecisionResult) -> str:
+def make_headline(result: PrecisionResult) -> str:
     found = next((row for row in result.recommendations if row.estimator), None)
     if found is None:
         return "Nothing that was measured is known to reach the error: give it more `seconds` or a larger `error`."
+    quantity = describe_quantity(found.quantity, found.control)
     return (
-        f"For {100 * result.goal:.3g} % error of {named(found.quantity, found.control)}: {found.spp} samples "
+        f"For {100 * result.goal:.3g} % error of {quantity}: {found.spp} samples "
         f"({found.estimator}), {found.seconds:.2g} s of processor time, here."
     )
 
 
-def sentence(found: Recommended, goal: float) -> str:
-    asked = f"{100 * goal:.3g} % error of {named(found.quantity, found.control)}{FAMILIES.get(found.family, '')}"
+def describe_recommendation(found: Recommended, goal: float) -> str:
+    quantity = describe_quantity(found.quantity, found.control)
+    goal_text = f"{100 * goal:.3g} % error of {quantity}{FAMILIES.get(found.family, '')}"
     if found.estimator is None:
-        return f"{asked}: not reached by anything that was measured; give it more `seconds` or a larger `error`"
+        return f"{goal_text}: not reached by anything that was measured; give it more `seconds` or a larger `error`"
     basis = "" if found.basis in ("interpolated", "fitted") else f" ({found.basis})"
-    return f"{asked}: {found.estimator}, {found.spp} samples, {found.seconds:.2g} s{basis}"
+    return f"{goal_text}: {found.estimator}, {found.spp} samples, {found.seconds:.2g} s{basis}"
 
 
-def cautions(points: Sequence[PrecisionPoint]) -> list[str]:
+def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
     """Return what has to be known of points: errors of few pixels, and a machine that most of the time, by the clock,
     took over twice the processor time."""
     heavy = sorted({point.estimator for point in points if point.heavy_tailed})
@@ -286,14 +290,14 @@ def cautions(points: Sequence[PrecisionPoint]) -> list[str]:
     return warnings
 
 
-def _errors(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
+def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
     rows = [point for point in points if point.quantity == quantity]
     columns: dict[str, Column] = {"control": "{0.control}"} if quantity == "gradient" else {}
     columns |= {
         "estimator": "{0.estimator}",
         "samples": "{0.spp}",
         "error": lambda point: f"{'' if point.known else '< '}{100 * point.rms:.3g} %",
-        "95 %": lambda point: "heavy tails" if point.heavy_tailed else _between(point.interval),
+        "95 %": lambda point: "heavy tails" if point.heavy_tailed else _format_interval(point.interval),
     }
     if quantity == "gradient":
         columns["cosine"] = lambda point: f"{math.nan if point.cosine is None else point.cosine:.3f}"
@@ -301,7 +305,7 @@ def _errors(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
     return ResultPart.table(rows, {**columns, "repeats": "{0.repeats}"}, title=quantity.capitalize())
 
 
-def _between(interval: Interval | None) -> str:
+def _format_interval(interval: Interval | None) -> str:
     return "" if interval is None else f"{100 * interval[0]:.2g} to {100 * interval[1]:.2g}"
 
 

@@ -61,20 +61,20 @@ class ReferenceValue:
     size: float
     parts: int
 
-    def beside(self, value: Array) -> dict[str, float]:
+    def compare(self, value: Array) -> dict[str, float]:
         """Return how a value (n,) compares: the norm of the difference over that of the reference, the cosine of the
         angle between them, and the sum of the fourth powers of the relative errors of the single numbers; NaN where
         one is zero, or where the numbers are too few to say anything about tails."""
         away, norm = value - self.value, float(np.linalg.norm(value)) * self.size
         wide = len(value) >= WIDE and self.size > 0.0
         return {
-            "error": _ratio(float(np.linalg.norm(away)), self.size),
+            "error": relative_error(float(np.linalg.norm(away)), self.size),
             "cosine": float(value @ self.value) / norm if norm > 0.0 else math.nan,
             "fourth": float(np.sum((away / self.size) ** 4)) if wide else math.nan,
         }
 
 
-def reference_of(
+def estimate_reference(
     parts: Sequence[Array], function: Callable[[Array], Array] = lambda mean: mean, bias: float = 0.0
 ) -> ReferenceValue:
     """Return a function, (n,) to (m,), of the mean of at least two independent parts, with its error by the jackknife
@@ -95,10 +95,10 @@ def reference_of(
     bend = (count - 1) * float(np.linalg.norm(middle - value)) if count > 2 else 0.0
     bend = max(0.0, bend - scatter)  # the estimate of the bias scatters as much as the value does
     size = float(np.linalg.norm(value))
-    return ReferenceValue(value, _ratio(math.hypot(scatter, bend, bias), size), size, count)
+    return ReferenceValue(value, relative_error(math.hypot(scatter, bend, bias), size), size, count)
 
 
-def point_of(setting: SampleSetting, samples: Sequence[Numbers], floor: float = 0.0) -> PrecisionPoint:
+def summarize_samples(setting: SampleSetting, samples: Sequence[Numbers], floor: float = 0.0) -> PrecisionPoint:
     """Return what measurements of a setting say about its error, given the reference's own (`floor`).
 
     The samples' noise and the reference's are independent, so their squares add: error^2 = mean of squares - floor^2.
@@ -106,15 +106,15 @@ def point_of(setting: SampleSetting, samples: Sequence[Numbers], floor: float = 
     from the scatter of the squares on a logarithmic scale; there is none of a single one and of heavy tails.
     """
     squares = [numbers["error"] ** 2 for numbers in samples]
-    raw, heavy, interval = statistics.fmean(squares), heavy_tailed(samples), None
+    raw, heavy, interval = statistics.fmean(squares), is_heavy_tailed(samples), None
     known = raw > (KNOWN * floor) ** 2 and math.isfinite(raw) and raw > 0.0
     error = math.sqrt(raw - floor**2) if known else math.sqrt(raw)
     if known and not heavy and len(squares) > 1:
         relative = 0.5 * statistics.stdev(squares) / math.sqrt(len(squares)) / raw
         factor = math.exp(min(50.0, float(stdtrit(len(squares) - 1, (1.0 + LEVEL) / 2.0)) * relative))
         interval = (error / factor, error * factor)
-    timed = [name for name in ("seconds", "wall_seconds") if name in samples[0]]
-    times = {name: typical([numbers[name] for numbers in samples]) for name in timed}
+    time_names = [name for name in ("seconds", "wall_seconds") if name in samples[0]]
+    times = {name: median_time([numbers[name] for numbers in samples]) for name in time_names}
     cosine = [numbers["cosine"] for numbers in samples if "cosine" in numbers]
     status = "ok" if known else "reference unusable"
     more: dict[str, object] = {"repeats": len(samples), "status": status, "error": error, "interval": interval}
@@ -123,7 +123,7 @@ def point_of(setting: SampleSetting, samples: Sequence[Numbers], floor: float = 
     return PrecisionPoint.of({**vars(setting), **more, **times})
 
 
-def heavy_tailed(samples: Sequence[Numbers]) -> bool:
+def is_heavy_tailed(samples: Sequence[Numbers]) -> bool:
     """Whether fewer than `LEAST_VALUES` pixels hold the error of some pictures: (sum of squares)^2 / (sum of fourth
     powers) counts how many, if all of them were equal. False where the pictures are too small to tell.
 
@@ -134,12 +134,12 @@ def heavy_tailed(samples: Sequence[Numbers]) -> bool:
     return fourth > 0.0 and squares**2 < LEAST_VALUES * fourth
 
 
-def typical(seconds: Sequence[float]) -> float:
+def median_time(seconds: Sequence[float]) -> float:
     """Return the median of times without those of calls that warm up; the last one where there are no others."""
     return statistics.median(seconds[WARM_UP:] or seconds[-1:])
 
 
-def _ratio(error: float, size: float) -> float:
+def relative_error(error: float, size: float) -> float:
     return error / size if size > 0.0 else (0.0 if error == 0.0 else math.inf)
 
 
@@ -165,13 +165,13 @@ def fit_line(points: Sequence[PrecisionPoint], or_steeper: bool | None = None) -
     )  # fmt: skip
 
 
-def warning_of(slope: PrecisionSlope, points: Sequence[PrecisionPoint]) -> str | None:
+def describe_disagreement(slope: PrecisionSlope, points: Sequence[PrecisionPoint]) -> str | None:
     """Return a sentence where a slope disagrees with theory, with the likeliest reason; None where it agrees."""
     if slope.agrees is not False or slope.theory is None:
         return None
     if slope.slope <= slope.theory:
         reason = "the fewest samples are not in the asymptotic range yet"
-    elif levels_off(points):
+    elif has_leveled_off(points):
         reason = "it levels off: a bias is left that no samples remove"
     else:
         reason = "heavy-tailed noise, clipping at few samples or a bias"
@@ -182,19 +182,19 @@ def warning_of(slope: PrecisionSlope, points: Sequence[PrecisionPoint]) -> str |
     )
 
 
-def levels_off(points: Sequence[PrecisionPoint]) -> bool:
+def has_leveled_off(points: Sequence[PrecisionPoint]) -> bool:
     """Whether the last step between known points is less than half as steep as the first ones were."""
     known = sorted((point for point in points if point.known), key=lambda point: point.spp)
     steps = [math.log(b.rms / a.rms) / math.log(b.spp / a.spp) for a, b in pairwise(known) if b.spp > a.spp]
     return len(steps) >= 2 and steps[-1] > 0.5 * min(*steps[:-1], 0.0)
 
 
-def exactly(point: PrecisionPoint, samples: float) -> int:
+def round_up_exactly(point: PrecisionPoint, samples: float) -> int:
     return math.ceil(samples - 1e-9)
 
 
-def reaching(
-    points: Sequence[PrecisionPoint], goal: float, round_up: RoundUp = exactly, or_steeper: bool | None = None
+def recommend_count(
+    points: Sequence[PrecisionPoint], goal: float, round_up: RoundUp = round_up_exactly, or_steeper: bool | None = None
 ) -> Recommended | None:
     """Return the least sample count at which one line reaches a relative error, and what it takes there.
 
@@ -225,19 +225,21 @@ def reaching(
         basis = "measured" if samples <= least else "fitted" if samples <= largest else "extrapolated"
         count = None if samples > FURTHEST * largest else max(samples, least)
     else:
-        count, basis = _between_points(ordered, goal, line, or_steeper)
+        count, basis = _interpolate_count(ordered, goal, line, or_steeper)
     if count is None:
         return None
     spp = round_up(ordered[0], count)
-    error = fitted(spp) if explains else _at(ordered, spp, [point.rms for point in ordered], falls)
-    seconds = _at(ordered, spp, [point.seconds for point in ordered], 1.0)
+    error = fitted(spp) if explains else _interpolate_value(ordered, spp, [point.rms for point in ordered], falls)
+    seconds = _interpolate_value(ordered, spp, [point.seconds for point in ordered], 1.0)
     return Recommended(
         quantity=ordered[0].quantity, control=ordered[0].control, goal=goal, estimator=ordered[0].estimator, spp=spp,
         seconds=seconds, error=error, basis=basis,
     )  # fmt: skip
 
 
-def confirmed(found: Recommended, point: PrecisionPoint, round_up: RoundUp = exactly) -> Recommended:
+def confirm_recommendation(
+    found: Recommended, point: PrecisionPoint, round_up: RoundUp = round_up_exactly
+) -> Recommended:
     """Return a recommendation that rests on a point measured after it was chosen, with seeds of its own.
 
     What looks cheapest among noisy points is mostly a lucky one, and its error looks smaller than it is. New
@@ -251,14 +253,14 @@ def confirmed(found: Recommended, point: PrecisionPoint, round_up: RoundUp = exa
     return found.model_copy(update={**new, "basis": "confirmed", "repeats": point.repeats})
 
 
-def _between_points(
+def _interpolate_count(
     ordered: Sequence[PrecisionPoint], goal: float, line: PrecisionSlope | None, or_steeper: bool | None
 ) -> tuple[float | None, str]:
     """The samples at which ordered points stay at or below a goal from there on."""
     last = ordered[-1]
     if last.rms > goal:
         slope = line.slope if line else None if or_steeper is None else MONTE_CARLO
-        if slope is None or not last.known or slope > -0.1 or levels_off(ordered):
+        if slope is None or not last.known or slope > -0.1 or has_leveled_off(ordered):
             return None, ""
         factor = (goal / last.rms) ** (1.0 / max(slope, -1.0))
         return (last.spp * factor if factor <= FURTHEST else None), "extrapolated"
@@ -271,7 +273,7 @@ def _between_points(
     return before.spp * (good.spp / before.spp) ** share, "interpolated"
 
 
-def _at(ordered: Sequence[PrecisionPoint], spp: int, values: Sequence[float], slope: float) -> float:
+def _interpolate_value(ordered: Sequence[PrecisionPoint], spp: int, values: Sequence[float], slope: float) -> float:
     """A value at a sample count: interpolated, or continued along a slope, on logarithmic axes."""
     counts, logs = np.log([float(point.spp) for point in ordered]), np.log([max(1e-300, value) for value in values])
     beyond = max(0.0, math.log(spp) - counts[-1])
