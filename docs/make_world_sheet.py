@@ -22,8 +22,7 @@ import torch
 from PIL import Image, ImageOps
 
 import advsearch
-from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.color import to_8_bit
+from advsearch.scene.color import linear_to_srgb, to_8_bit
 
 IMAGES = Path(__file__).resolve().parent / "images"
 COLUMNS, WIDE = 4, 60.0
