@@ -68,7 +68,7 @@ RULES = {
     "settings": Rule(set(), {"pydantic", "yaml", "typing_extensions"}),
     "config": Rule({"settings"}, {"pydantic", "yaml", "typing_extensions"}),
     "scene": Rule(set()),
-    "bundled": Rule({"scene"}),
+    "bundled": Rule(set()),
     "controls": Rule({"scene"}),
     "models": Rule(set(), {"torch", "numpy", "safetensors"}),
     "tasks": Rule({"models"}, {"torch"}),

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -124,7 +125,7 @@ class TextureControl(Control):
         else:  # each texel value on its own
             budget = Budget(norm, radius(norm, epsilon, texels.numel()))
             group = Group("texels", texels.numel(), ("adjoint",), budget)
-            painter = Painter(texels.reshape(-1), group, lambda u: u.reshape(-1, 3))
+            painter = Painter(texels.reshape(-1), group, as_texels)
         self._on, self._original, self._materials, self._where = part.name, original, ", ".join(names or ()), where
         self._painter, self._unchanged = painter, painter.texels(painter.start)
         self.start, self.groups = painter.start, (painter.group,)
@@ -174,7 +175,13 @@ class Painter(NamedTuple):
 
     start: Tensor  # (d,) float32, the slice that gives the original
     group: Group  # the slice as a group
-    texels: Callable[[Tensor], Tensor]  # (d,) in [0, 1] to (n, 3) display-referred sRGB in [0, 1]; differentiable
+    # (d,) in [0, 1] to (n, 3) display-referred sRGB in [0, 1]; differentiable, and can be pickled for workers
+    texels: Callable[[Tensor], Tensor]
+
+
+def as_texels(u: Tensor) -> Tensor:
+    """Return the texels (n, 3) that coordinates (3 n,) are."""
+    return u.reshape(-1, 3)
 
 
 def recoloured(original: Tensor, centres: Tensor, budget: Budget) -> Painter:
@@ -186,12 +193,13 @@ def recoloured(original: Tensor, centres: Tensor, budget: Budget) -> Painter:
         apart = torch.cdist(centres, centres) + torch.diag(torch.full((len(centres),), 10.0))
         spread = max(0.5 * float(apart.min(dim=1).values.mean()), 1e-3)
     weights = torch.softmax(-squared / (2.0 * spread**2), dim=-1)
-
-    def texels(u: Tensor) -> Tensor:
-        change = weights.to(u.device) @ (u.reshape(-1, 3) - centres.to(u.device))
-        return (original.to(u.device) + change).clamp(0.0, 1.0)
-
+    texels = partial(_paint_palette, original, weights, centres)
     return Painter(centres.reshape(-1), Group("palette", centres.numel(), ("adjoint", "differences"), budget), texels)
+
+
+def _paint_palette(original: Tensor, weights: Tensor, centres: Tensor, u: Tensor) -> Tensor:
+    change = weights.to(u.device) @ (u.reshape(-1, 3) - centres.to(u.device))
+    return (original.to(u.device) + change).clamp(0.0, 1.0)
 
 
 def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter:
@@ -207,14 +215,18 @@ def waved(original: Tensor, where: Tensor, count: int, radius: float) -> Painter
     number = torch.arange(count)
     down, across = (torch.cos(math.pi * (torch.arange(side) + 0.5)[:, None] * number / side) for side in where.shape)
     reach = (WAVE_REACH / (1.0 + torch.hypot(number[:, None].float(), number[None, :].float())))[..., None]
-
-    def texels(u: Tensor) -> Tensor:
-        amplitudes = (2.0 * u - 1.0).reshape(count, count, 3) * reach.to(u.device)
-        summed = torch.einsum("hm,wn,mnc->hwc", down.to(u.device), across.to(u.device), amplitudes)[where.to(u.device)]
-        return (original.to(u.device) + radius * torch.tanh(summed)).clamp(0.0, 1.0)
-
     start = torch.full((count * count * 3,), 0.5)
+    texels = partial(_paint_waves, original, where, radius, (down, across, reach))
     return Painter(start, Group("amplitudes", len(start), ("adjoint",)), texels)
+
+
+def _paint_waves(
+    original: Tensor, where: Tensor, radius: float, waves: tuple[Tensor, Tensor, Tensor], u: Tensor
+) -> Tensor:
+    down, across, reach = (part.to(u.device) for part in waves)
+    amplitudes = (2.0 * u - 1.0).reshape(*reach.shape[:2], 3) * reach
+    summed = torch.einsum("hm,wn,mnc->hwc", down, across, amplitudes)[where.to(u.device)]
+    return (original.to(u.device) + radius * torch.tanh(summed)).clamp(0.0, 1.0)
 
 
 def palette(image: Tensor, weight: Floats, count: int) -> Tensor:

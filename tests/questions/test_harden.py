@@ -166,7 +166,8 @@ def test_a_measurement_over_viewpoints_may_be_predicted() -> None:
 @pytest.mark.slow
 def test_workers_do_what_this_process_does(attacks: list[tuple[str, int | None]]) -> None:
     config = HardenConfig(**{**SMALL, "model": "reference", "controls": "texture,pose", "epsilon": {"texture": 0.03}})
-    weights = safetensors.save(load().copy_network().state_dict())
+    state = load().copy_network().state_dict()  # channels last, which safetensors refuses
+    weights = safetensors.save({name: one.contiguous() for name, one in state.items()})
     looking = partial(SceneWork.looked_at, number=0, weights=weights)
     wanted = [drawing(1, "texture", plain=1), drawing(0, "pose"), looking]
     here = SceneWork(config, load(), harden_scenes.splits_of(config, load()))(wanted)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import pickle
 import shutil
 import tarfile
 import weakref
@@ -141,6 +142,15 @@ def test_lessons_of_textures_let_go_of_their_scene() -> None:
     assert lesson.worst.shape == (16, 16, 3) and not torch.equal(lesson.worst, lesson.plain)
     for views, steps in ((6, 2), (2, 2), (1, 4)):  # of 24 pictures, in two epochs: 20 plain ones, and 6 / views of this
         assert course_of(student(), epochs=2, views=views).steps([lesson, *plain * 20]) == steps
+
+
+@pytest.mark.parametrize("form", ["texels", "palette", "waves"])
+def test_a_lesson_of_a_texture_comes_back_from_a_worker(form: str) -> None:
+    controls = {"texture": {"resolution": 4, "form": form}}
+    config = AttackConfig(object="mug", resolution=(16, 16), controls=controls, over={"camera": {}}, measure="no")
+    (lesson,) = lessons(problem_of(config, load_scene("mug"), load_model("reference")), 1, 0)
+    returned = pickle.loads(pickle.dumps(lesson))
+    assert isinstance(lesson, TextureLesson) and torch.equal(returned.worst, lesson.worst)
 
 
 def test_an_epoch_looks_six_times_at_a_scene_with_a_texture() -> None:
