@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
@@ -69,11 +70,23 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         return sum(1 for _ in self)
 
     def get_help(self, name: str) -> str:
-        """Return what an entry is, in a sentence: of the catalog, or of another one the docstring's first line."""
+        """Return what an entry is, in a sentence: of the catalog, or of another one the docstring's first line; of one
+        that can't be imported, why."""
         own = self.own.get(name)
         if isinstance(own, BuiltIn):
             return f"{own.help[0].upper()}{own.help[1:]}."
-        return get_first_doc_line(self[name])
+        try:
+            return get_first_doc_line(self[name])
+        except InputError as error:
+            return f"{error}."
+
+    def list_usable(self) -> dict[str, Entry]:
+        """Return all entries but those of packages that can't be imported."""
+        usable = dict[str, Entry]()
+        for name in self:
+            with suppress(InputError):
+                usable[name] = self[name]
+        return usable
 
     def names_class(self, name: str) -> bool:
         """Whether a name is that of a class to import, and not of an instance of a registered entry ("light:Key")."""

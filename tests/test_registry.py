@@ -70,6 +70,8 @@ def test_an_entry_that_does_not_fit_is_named_with_its_package(
     with pytest.raises(InputError, match=rf"entry point two = other:two of group advsearch\.numbers: {complaint}"):
         numbers["two"]
     assert list(numbers) == ["one", "mod", "two", "three"] and numbers["three"] == 3  # it disturbs no other
+    assert [*numbers.list_usable()] == ["one", "mod", "three"]
+    assert numbers.get_help("two").endswith("repair or uninstall the package that declares it.")
 
 
 @pytest.mark.parametrize("known", [CONTROLS, POLICIES, OBJECTIVE_KINDS, TASKS, SOURCES], ids=lambda known: known.group)

@@ -60,14 +60,15 @@ def _begin_lower(sentence: str) -> str:
 def export(args: argparse.Namespace) -> int:
     out = None if args.out is None else Path(args.out)
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
-    suffixes = {EXPORTERS[name].suffix or name: name for name in EXPORTERS}
+    usable = EXPORTERS.list_usable()
+    suffixes = {exporter.suffix or name: name for name, exporter in usable.items()}
     format = args.format or suffixes.get(by_name, by_name)
     if format == "fiftyone":
         raise InputError("--format: fiftyone was removed, since FiftyOne reads COCO; use --format coco")
     if args.format and format not in (*EXPORTERS, *FORMATS):
         raise UnknownNameError("format", format, (*EXPORTERS, *FORMATS))
     for option in OPTIONS:
-        owners = [name for name in EXPORTERS if option in EXPORTERS[name].options]
+        owners = [name for name, exporter in usable.items() if option in exporter.options]
         if format not in owners and getattr(args, option) is not None:
             raise InputError(f"--{option}: belongs to --format {' and '.join(owners)}; leave it out")
     if format not in EXPORTERS:

@@ -59,7 +59,8 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
 
 def unknown_control(kind: str, hint: str = "", instances: Iterable[str] = ()) -> UnknownNameError:
     """Return the error for a control that there is not; it says of which it is a parameter, or else the hint."""
-    owners = [name for name in CONTROLS if any(one.name == kind for one in CONTROLS[name].parameters)]
+    usable = CONTROLS.list_usable().items()
+    owners = [name for name, control in usable if any(one.name == kind for one in control.parameters)]
     of = f"It is a parameter: write {' or '.join(f'{name}.{kind}' for name in owners)}." if owners else hint
     return UnknownNameError("control", kind, {*CONTROLS, *instances}, of)
 
@@ -174,7 +175,7 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
         )
     for control in controls:
         if control.name != control.kind and control.name in scene.around:
-            able = ", ".join(kind for kind in CONTROLS if CONTROLS[kind].of_a_mesh)
+            able = ", ".join(kind for kind, usable in CONTROLS.list_usable().items() if usable.of_a_mesh)
             raise InputError(
                 f"`controls` {control.kind}:{control.name}: {control.kind} can't be given to another mesh than the "
                 f"object; {able} can, as in pose:{control.name}"

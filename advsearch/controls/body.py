@@ -21,8 +21,8 @@ class BodyControl(Control):
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         known = {parameter.name for parameter in cls.parameters}
-        parts = (parts.part_of_a_rig(name) for name in settings if name not in known)
-        return (*cls.parameters, *(part for part in parts if part is not None))
+        declared = (parts.part_of_a_rig(name) for name in settings if name not in known)
+        return (*cls.parameters, *(parameter for parameter in declared if parameter is not None))
 
     @property
     def rig(self) -> parts.MeshRig:
