@@ -202,10 +202,19 @@ def curve(asked: RunContext[AttackConfig]) -> CurveResult:
                 break
             renders.update(summary.renders)
             epsilon = summary.epsilon if part.epsilon is None else part.epsilon
-            more = {"object": part.of, "clean": summary.clean.control, "tried": part.epsilon, "epsilon": epsilon}
-            more |= {"flips_at": epsilon if summary.ending == "found" else None, "renders": dict(renders)}
-            margin = summary.verified and summary.verified.margin
-            row = results.ObjectRow.of({**vars(summary), **more, "margin": margin})
+            row = results.ObjectRow(
+                object=part.of,
+                clean=summary.clean.control,
+                ending=summary.ending,
+                epsilon=epsilon,
+                flips_at=epsilon if summary.ending == "found" else None,
+                verified=summary.verified,
+                margin=summary.verified and summary.verified.margin,
+                run=summary.run,
+                tried=part.epsilon,
+                average=summary.average,
+                renders=dict(renders),
+            )
             if row.ending in SETTLED:
                 break
         rows.append(row)
