@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -272,3 +274,23 @@ def test_a_variant_keeps_the_name_of_what_it_changes_as_a_whole(street: Path) ->
     assert dry["road"].material == dull
     assert len(dry["house"].mesh.faces) == 12 == len(snow["house"].mesh.faces) + len(snow["snow"].mesh.faces)
     assert (snow["snow"].mesh.normals[:, 2] == 1.0).all() and snow["snow"].base_color.max() > 0.89
+
+
+def test_what_a_place_has_not_is_said(street: Path) -> None:
+    mesh = street.parent / "street.glb"
+    data = mesh.read_bytes()
+    (length,) = struct.unpack_from("<12xI", data)
+    header, rest = json.loads(data[20 : 20 + length]), data[20 + length :]
+    corners = header["meshes"][0]["primitives"][0]["attributes"]
+    corners["COLOR_0"] = corners["NORMAL"]
+    header["animations"] = [{"channels": [], "samplers": []}]
+    header["nodes"].append({"extensions": {"KHR_lights_punctual": {"light": 0}}})
+    header["scenes"][0]["nodes"].append(len(header["nodes"]) - 1)
+    header["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text + rest
+    mesh.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+    notes = describe("car", street).notes
+    for word in ("colours of vertices", "skins or animations", "has lights"):
+        assert sum(word in note for note in notes) == 1, notes

@@ -189,7 +189,7 @@ def read_place(path: Path, file: PlaceFile, variant: str | None) -> Place:
         replace(part, is_ground=part.name in file.ground, solids=solids if number == 0 else ())
         for number, part in enumerate(parts)
     ]
-    return Place(safe_name(path.parent), file, tuple(placed), tuple(notes))
+    return Place(safe_name(Path(os.path.abspath(path)).parent), file, tuple(placed), tuple(notes))
 
 
 @lru_cache(maxsize=8)

@@ -134,6 +134,7 @@ def read_place_meshes(path: Path, variant: str | None) -> tuple[list[MeshPart], 
     used = [name for name in header.extensionsUsed if name not in READ_HERE]
     required = [name for name in header.extensionsRequired if name not in READ_HERE]
     left_out(header.model_copy(update={"extensionsUsed": used, "extensionsRequired": required}), notes)
+    _note_left_out(header, drawn, notes)
     check_faces(path, sum(len(primitive.part.faces) for primitive in drawn))
     groups = _group_by_material(header, drawn)
     if not groups:
@@ -145,6 +146,16 @@ def read_place_meshes(path: Path, variant: str | None) -> tuple[list[MeshPart], 
         part = _make_part(path, names.free(name), members, surfaces[material])
         parts.append(_with_finish(path, header, material, part))
     return parts, list(notes)
+
+
+def _note_left_out(header: Header, drawn: Sequence[DrawnPrimitive], notes: Notes) -> None:
+    """Say what the file has that an object would have, and a place has not."""
+    if any(primitive.part.colors is not None for primitive in drawn):
+        notes.say(" has colours of vertices, which are left out; paint them into a texture")
+    if header.skins or header.animations:
+        notes.say(" has skins or animations, which are left out: it is shown as it is stored")
+    if any(node.lamp is not None for node in header.nodes):
+        notes.say(" has lights, which are left out: name what shines in `lamps`, or let its material emit light")
 
 
 def _find_variant(path: Path, header: Header, variant: str) -> int:
