@@ -111,7 +111,7 @@ CORE_NOT_YET: frozenset[str] = frozenset(
         "advsearch/api/projection.py",
         "advsearch/cli/show.py",
         "advsearch/engine/journal.py",
-        "advsearch/questions/attack/carry_out.py",
+        "advsearch/questions/attack/run.py",
         "advsearch/questions/report/evidence.py",
         "advsearch/questions/report/recorded.py",
         "advsearch/scene/cycles.py",

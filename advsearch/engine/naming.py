@@ -156,8 +156,13 @@ RUN_SETTINGS = ("epsilon", "norm", "texture_resolution", "path", "shutter", "rol
 A configuration without such a setting counts as one that does not say it."""
 
 
-def given_to(config: SceneConfig, controls: Controls) -> tuple[Control, ...]:
-    """Return control instances, with what they take of the configuration where they say nothing themselves."""
+def given_to(config: SceneConfig, controls: Controls, *, are_searched: bool = True) -> tuple[Control, ...]:
+    """Return control instances, with what they take of the configuration where they say nothing themselves.
+
+    Controls that are not searched, but vary by chance, have no budget.
+    """
+    if not are_searched:
+        config = config.model_copy(update={"epsilon": None})
     asked = controls_by_name(controls)
     as_controls(controls)  # refuses what is none
     ready: dict[str, Control | Mapping[str, object]] = {}

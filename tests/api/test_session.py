@@ -33,7 +33,7 @@ from advsearch.controls.texture import TextureControl
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
-from advsearch.questions.attack import carry_out as attacking
+from advsearch.questions.attack import python
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.wording import objective_text
@@ -82,7 +82,7 @@ def victim(threshold: float, name: str = "bright") -> advsearch.Model:
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What an attack would do, without doing it."""
-    monkeypatch.setattr(attacking, "carry_out", lambda job, *_: job)
+    monkeypatch.setattr(python, "run_attack", lambda parts, *_: parts)
     return advsearch.attack
 
 

@@ -19,7 +19,6 @@ from advsearch.engine.transport import remark
 from advsearch.options import OUT_OF_VIEW, Value
 from advsearch.questions.attack import result as kept
 from advsearch.questions.attack.result import AttackResult, KeptPicture
-from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import UNPRINTED
 from advsearch.questions.attack.summary import AttackSummary, DifferentFailures
 from advsearch.report.wording import number_text
@@ -35,10 +34,33 @@ T = TypeVar("T")
 MOST_NUMBERS = 4096  # Numbers of a distribution that a summary names, at most
 
 
-def summarise(
-    config: AttackConfig, objective: str | None, findings: Findings, journal: Journal, stages: Stages,
+def make_result(
+    findings: Findings,
+    journal: Journal,
+    stages: Stages,
     warnings: Sequence[str],
-) -> AttackResult:  # fmt: skip
+    *,
+    object_name: str,
+    judge: str,
+    policy: str,
+    objective: str | None,
+    printable: bool,
+    command_line: str,
+) -> AttackResult:
+    """Make the result of an attack from what it found, and store it with its images in the run, if there is one.
+
+    Args:
+        findings: of the attack.
+        journal: of the run.
+        stages: which took their time.
+        warnings: so far.
+        object_name: of the object under attack.
+        judge: the thing that is judged.
+        policy: by name, as requested.
+        objective: by name; None for the task's own.
+        printable: whether the search had print terms.
+        command_line: repeats the attack.
+    """
     problem, search, run = journal.problem, findings.search, journal.run
     space, start = problem.searched_space, problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
@@ -62,10 +84,10 @@ def summarise(
     summary = AttackSummary.of(
         {
             "run": None if run is None else str(run.path),
-            "object": config.object,
-            "judge": config.judge,
-            "policy": config.policy_name,
-            "command_line": config.command_line(),
+            "object": object_name,
+            "judge": judge,
+            "policy": policy,
+            "command_line": command_line,
             "objective": name_objective(problem.task, objective),
             "warnings": [*warnings, *_remarks(findings, problem, journal)],
             "drive": drive,
@@ -73,7 +95,7 @@ def summarise(
             "seconds": {**stages.seconds, "total": stages.total},
             **_asked(problem),
             **_seen(problem, findings, clean, adversarial),
-            "printability": _printability(problem, findings) if config.printable else None,
+            "printability": _printability(problem, findings) if printable else None,
         }
     )
     if run is not None:

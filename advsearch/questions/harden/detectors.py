@@ -24,7 +24,8 @@ from advsearch.errors import FileFormatError, InputError, ModelError
 from advsearch.models import Model
 from advsearch.models.reference import Trainable
 from advsearch.pictures import upright
-from advsearch.questions.attack.carry_out import attack_on, problem_of
+from advsearch.questions.attack.carry_out import problem_of
+from advsearch.questions.attack.run import attack_on
 from advsearch.questions.harden.rounds import Course, MakeOptimiser, Score, Take
 from advsearch.questions.harden.scenes import SceneWork
 from advsearch.runs.files import write_png

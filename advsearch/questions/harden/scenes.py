@@ -29,7 +29,8 @@ from advsearch.models.reference import copied_network
 from advsearch.models.source import frozen
 from advsearch.options import get_outcome
 from advsearch.progress import NullProgress, Progress
-from advsearch.questions.attack.carry_out import attack_on, problem_of
+from advsearch.questions.attack.carry_out import problem_of
+from advsearch.questions.attack.run import attack_on
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.harden.lessons import Lesson, has_matrix, lessons
 from advsearch.questions.harden.result import ALL, HardenConfig

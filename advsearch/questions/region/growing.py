@@ -67,7 +67,7 @@ def region_around(asked: RunContext[RegionConfig]) -> RegionResult:
     for text in warnings:
         stages.progress.message(text)
     varied = _varied(problem, config)
-    verifier = Verifier(Journal(asked.run, Shared(problem)), ladder_of(config), stages)
+    verifier = Verifier(Journal(asked.run, Shared(problem)), ladder_of(config.verify_spp, config.pixel_sampler), stages)
     findings, grown = verifier.findings, GrownRegion()
     with asked.until_interrupted():
         grown = _grown(verifier, config, varied, asked.run)

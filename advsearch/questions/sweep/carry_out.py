@@ -255,7 +255,10 @@ def _job(
     networks, warnings = load_models(models, made, config)
     _check_different([model.name for model in networks])  # what a file or a function gives may have another's name
     scenes = [place.scene for place in places]
-    tasks = tuple(judging.shown(made.on(network), network, scenes, config) for network in networks)
+    tasks = tuple(
+        judging.calibrate_task(made.on(network), network, scenes, config.label, config.judge, config.image_settings)
+        for network in networks
+    )
     warnings += [remark for task in tasks for remark in task.remarks]
     tasks = tuple(map(each_thing, tasks)) if config.judge == ALL else tasks
     own = {place.object: place.scene.description.object.label for place in places}
