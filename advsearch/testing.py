@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -153,22 +152,22 @@ def _asserted(
     from advsearch.questions.test.carry_out import test_from_config
 
     name = str(claim["claim"]).replace("_", "-")
-    with ExitStack() as stack:
-        stack.enter_context(in_turn())
+    objects: dict[tuple[str, str], Any] = {}
+    with in_turn():
         for named in (settings, *({"model": one} for one in models.values())):
             allow_named(named)
         given, said = dict(settings), dict(claim)
         if isinstance(object, loading.Scene):
             given |= {key: value for key, value in loading.scene_as_settings(object).items() if value is not None}
-            stack.enter_context(loading.lending(loading.SCENE, {given["object"]: object}))
+            objects["scene", given["object"]] = object
         else:
             given["object"] = str(object)
         for key, model in models.items():
             (given if key == "model" else said)[key] = model_name(model)
             if not isinstance(model, (str, Path)):
-                stack.enter_context(loading.lending(loading.MODEL, {model_name(model): model}))
+                objects["model", model_name(model)] = model
         if instances := loading.instances_in(given.get("controls", ())):
-            stack.enter_context(loading.lending(loading.CONTROL, {one.name: one for one in instances}))
+            objects |= {("control", control.name): control for control in instances}
             given["controls"] = loading.settings_of(given["controls"])
         title = f"assert_{claim['claim']}"
         values = {"title": title, "settings": given, "seed": seed, "confidence": confidence, "claims": {name: said}}
@@ -176,7 +175,7 @@ def _asserted(
         only_here = [PythonOnly("call", f"of {title}")]
         only_here += [PythonOnly("model", model_name(model)) for model in models.values() if exists_here(model)]
         config = SuiteConfig(suite=title, run=None if run is None else str(run)).with_only_here(only_here)
-        result = test_from_config(config, suite=suite)
+        result = test_from_config(config.with_python_objects(objects), suite=suite)
     (claimed,) = result.claims
     if claimed.answer != "held":
         test = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]

@@ -16,7 +16,7 @@ from advsearch import threads
 from advsearch.config import SceneConfig
 from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
 from advsearch.controls.ranges import is_number
-from advsearch.engine.loading import CONTROL, MODEL, Controls, Scene, as_controls, controls_by_name, lent, load_scene
+from advsearch.engine.loading import Controls, Scene, as_controls, controls_by_name, load_scene
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.all_at_once import AllAtOnce
@@ -28,10 +28,19 @@ from advsearch.tasks import Task
 from advsearch.tasks.together import Together, together
 from advsearch.trust.foreign_code import plainly
 
+CONTROL, MODEL, SCENE = "control", "model", "scene"
+"""Roles of objects that a Python caller may pass in place of a name."""
+
 
 def scene_of(config: SceneConfig, name: str | None = None, environment: str | None = None) -> Scene:
-    """Load the scene that a configuration describes: its only object in its environment, or a named one."""
+    """Load the scene that a configuration describes: its only object in its environment, or a named one.
+
+    A scene that a Python caller passed is returned as it is.
+    """
     if name is None:
+        scene: Scene | None = config.python_object(SCENE, config.object)
+        if scene is not None:
+            return scene
         name, environment = config.object, config.environment
     return load_scene(name, environment, **told_of_scene(config))
 
@@ -73,7 +82,8 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
         part = of.of_one_image
         told = of is task or (part.labelled and not part.names_from)
         labels, prompt = (config.labels, config.prompt) if told else (None, None)
-        model = (lent(MODEL, model) if isinstance(model, str) else None) or model
+        if isinstance(model, str):
+            model = config.python_object(MODEL, model) or model
         return load_model(
             model, labels=labels, prompt=prompt, value_range=config.value_range, task=part, ask=config.ask
         )
@@ -163,11 +173,14 @@ def given_to(config: SceneConfig, controls: Controls, *, are_searched: bool = Tr
     """
     if not are_searched:
         config = config.model_copy(update={"epsilon": None})
-    asked = controls_by_name(controls)
-    as_controls(controls)  # refuses what is none
+    asked = {
+        name: given if isinstance(given, Control) else config.python_object(CONTROL, name) or given
+        for name, given in controls_by_name(controls).items()
+    }
+    as_controls(asked)  # refuses what is none
     ready: dict[str, Control | Mapping[str, object]] = {}
     for name, given in asked.items():
-        instance = given if isinstance(given, Control) else lent(CONTROL, name)
+        instance = given if isinstance(given, Control) else None
         for choice in _counting(type(instance), instance.settings()) if instance is not None else ():
             if getattr(config, choice.run_setting, None) is not None:
                 raise InputError(

@@ -24,12 +24,15 @@ from stand_ins import interrupted
 from torch import Tensor, nn
 
 import advsearch
+from advsearch.api.keywords import configured
+from advsearch.attacks import make_policy
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS
 from advsearch.controls import Control
 from advsearch.controls.base import NumberControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
+from advsearch.engine.naming import given_to, load_models, scene_of
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
@@ -43,6 +46,7 @@ from advsearch.runs.directory import is_run
 from advsearch.runs.store import Store
 from advsearch.scene.settings import Parameter
 from advsearch.settings import settings
+from advsearch.tasks import make_task
 
 SIDE = 16
 FAST: dict[str, Any] = {
@@ -251,7 +255,7 @@ def test_what_an_attack_takes_beside_its_settings_is_read_as_they_are(asked: Cal
     assert (job.scene.description.environment_name, job.scene.description.values["camera.azimuth"]) == ("loft", 3.0)
     assert job.scene.description.values["camera.exposure"] == 1.0
     job = asked("mug", policy={"name": "pgd", "momentum": np.float64(0.5)}, camera=["orbit"], task=["classification"])
-    assert "momentum: 0.5" in job.config.command_line() and job.policy == "pgd"
+    assert "momentum: 0.5" in job.config.command_line() and job.policy == make_policy("pgd", momentum=0.5)
     assert asked("mug", controls={"pose": {"yaw": np.array([0.0, 90.0])}}).config.controls == {
         "pose": {"yaw": [0.0, 90.0]}
     }
@@ -284,6 +288,20 @@ class Faded(NumberControl):
 
     def scene_inputs(self, values: Any, so_far: Any) -> dict[str, Tensor]:
         return {"object.roughness": 0.5 + 0.5 * values["amount"]}
+
+
+def test_settings_hold_the_objects_that_they_name_and_nothing_else_does(scene: advsearch.Scene) -> None:
+    model, faded = victim(0.5), Faded(amount=[0.0, 0.5])
+    config = configured(RegionConfig, object=scene, model=model, controls=[faded, "pose.yaw"])
+    assert [(part.role, part.name) for part in config.only_here] == [("model", "bright"), ("control", "Faded")]
+    assert (config.object, config.model, [*config.controls]) == ("mug", "bright", ["faded", "pose.yaw"])
+    attacked = AttackConfig.of(config, seed=3)  # goes on from one experiment to another
+    assert scene_of(attacked) is scene and given_to(attacked, attacked.controls)[0] is faded
+    (loaded,), _ = load_models([attacked.model], make_task("classification"), attacked)
+    assert loaded.module is model.module
+    with pytest.raises(AdvsearchError, match="bright"):  # the name alone is not known
+        load_models(["bright"], make_task("classification"), AttackConfig(object="mug", model="bright"))
+    assert scene_of(AttackConfig(object="mug")) is not scene
 
 
 def test_instances_and_names_go_together_in_every_question(

@@ -28,7 +28,7 @@ from advsearch.controls.ranges import by_distribution
 from advsearch.engine import judging, loading, naming
 from advsearch.engine.journal import worker_call
 from advsearch.engine.judging import AnyObjective, Described, Looked, Metrics
-from advsearch.engine.loading import SCENE, Controls, Scene, framed
+from advsearch.engine.loading import Controls, Scene, framed
 from advsearch.engine.naming import AnyModel, load_models, several
 from advsearch.engine.problem import Problem
 from advsearch.engine.rendering import facts_about
@@ -87,7 +87,7 @@ def parts_of(config: AttackConfig, scene: Scene | None = None, model: Model | No
     searched, drawn = controls_given(config, config.controls, config.over)
     task, objective = task_and_objective(config, config.task, config.objective)
     policy, keep = make_policy(config.policy_name, **config.policy_options), scene is None or model is None
-    scene = scene or loading.lent(SCENE, config.object) or naming.scene_of(config)
+    scene = scene or naming.scene_of(config)
     loaded = models_as_one(config.model, config, task) if model is None else (model, [])
     metrics = judging.load_metrics(config.metrics) if keep else {}
     return AttackParts(config, scene, loaded, task, searched, drawn, objective, policy, keep, metrics)
