@@ -53,7 +53,7 @@ def trace_attack(folder: Path) -> dict[str, dict[str, set[str]]]:
             return
         for name in ("config",) if is_searching else ("config", "epsilon"):
             if name in names_of_code[code]:
-                found[name][file].add(code.co_qualname)
+                found[name][file].add(code.co_name)
 
     sys.setprofile(profile)
     try:

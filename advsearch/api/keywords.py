@@ -1,8 +1,8 @@
-"""The settings of each question as keywords: what Python callers may write for them.
+"""The settings of each experiment as keywords: what Python callers may write for them.
 
 A setting is declared once: its default, its range, what it is. In Python more may be written for it than the text of a
-file (`hint_of`). Signatures and docstrings are made from both (`asks`), and of these what type checkers read
-(`tools/stubs.py`).
+file (`hint_of`). Signatures and docstrings are made from both (`asks`). Type checkers read the keywords of `attack` and
+`sweep` in code: `SceneKeywords` and its subclasses.
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import wraps
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any, Literal, TypedDict, TypeVar
 
+import numpy as np
 from torch import nn
 
 from advsearch.calls import check_types, unexpected
@@ -39,7 +41,43 @@ from advsearch.trust.code import allow_named
 from advsearch.trust.stored_files import is_shallow
 
 Names = str | Sequence[str]  # names in a list, or in a text with commas between them
-LOADED = (loading.Scene, Model, nn.Module)  # objects that an experiment may be given in place of a name
+
+
+class SceneKeywords(TypedDict, total=False):
+    """Settings that `attack` and `sweep` both take as keywords; their docstrings say what each is."""
+
+    environment: Path | Names | None
+    up: Literal["y", "z"] | None
+    facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None
+    size: float | None
+    unit: Literal["mm", "cm", "m", "in"] | None
+    camera: str | Path | None
+    set: Mapping[str, float | str | Sequence[float]] | None
+    things: str | Path | None
+    judge: str | Path
+    exposure: float
+    resolution: int | str | tuple[int, int] | None
+    labels: Path | Names | None
+    prompt: Path | Names | None
+    value_range: str | Sequence[float] | None
+    ask: Mapping[str, Any]
+    label: int | np.integer[Any] | Names | None
+    texture_resolution: int | None
+    denoise: Literal["oidn", "none"]
+    pixel_sampler: Literal["independent", "multijitter"]
+    seed: int
+    threads: int | None
+    deterministic: bool
+    overwrite: bool
+    specialise: bool
+    aov: str | Path | None
+    log: Literal["mlflow", "tensorboard", "wandb"] | None
+    path: str | Path | None
+    shutter: float | None
+    rolling: float | None
+    verify_spp: int | None
+    workers: int | None
+    cluster: str | Path | None
 
 
 class _Signature(inspect.Signature):
@@ -166,9 +204,9 @@ def configured(config: type[Made], **given: Any) -> Made:
     only_here: list[PythonOnly] = []
 
     scene, model = settings.get("object"), settings.get("model")
-    if isinstance(scene, LOADED) or isinstance(model, LOADED):
+    if isinstance(scene, loading.Scene) or isinstance(model, (Model, nn.Module)):
         check_not_spread(settings)
-    if isinstance(model, LOADED):
+    if isinstance(model, (Model, nn.Module)):
         settings["model"] = model_name(model)
         objects[MODEL, settings["model"]] = model
         only_here += [PythonOnly("model", settings["model"])] if exists_here(model) else []
@@ -179,7 +217,7 @@ def configured(config: type[Made], **given: Any) -> Made:
         objects[SCENE, settings["object"]] = scene
         only_here += [PythonOnly("scene")] if scene.only_here else []
     for name in ("controls", "over"):
-        controls = settings.get(name)
+        controls: Any = settings.get(name)
         instances = loading.instances_in(controls)
         if instances or isinstance(controls, Mapping):
             if loading.only_here(controls):

@@ -180,15 +180,15 @@ def given_to(config: SceneConfig, controls: Controls, *, are_searched: bool = Tr
     as_controls(asked)  # refuses what is none
     ready: dict[str, Control | Mapping[str, object]] = {}
     for name, given in asked.items():
-        instance = given if isinstance(given, Control) else None
-        for choice in _counting(type(instance), instance.settings()) if instance is not None else ():
-            if getattr(config, choice.run_setting, None) is not None:
-                raise InputError(
-                    f"{choice.run_setting}: control {instance.name} was given as an instance; set it there, as in "
-                    f"{type(instance).__name__}({choice.name}=...)"
-                )
         ready[name] = given
-        if not isinstance(given, Control):
+        if isinstance(given, Control):
+            for choice in _counting(type(given), given.settings()):
+                if getattr(config, choice.run_setting, None) is not None:
+                    raise InputError(
+                        f"{choice.run_setting}: control {given.name} was given as an instance; set it there, as in "
+                        f"{type(given).__name__}({choice.name}=...)"
+                    )
+        else:
             taken = {}
             for choice in _choices(name, given) or ():
                 value = getattr(config, choice.run_setting, None)

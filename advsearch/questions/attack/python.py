@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from torch import Tensor
 
 from advsearch import losses
-from advsearch.api.keywords import asks
+from advsearch.api.keywords import Names, SceneKeywords, asks
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.config import SceneConfig
@@ -35,6 +35,30 @@ from advsearch.runs.directory import begun, is_run, run_path
 from advsearch.settings import PythonOnly
 from advsearch.tasks import AnyTask, OwnTask, Task, make_task
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+class AttackKeywords(SceneKeywords, total=False):
+    """Settings that `attack` takes as keywords, besides its own arguments."""
+
+    spp: int | Literal["auto"] | None
+    epsilon: float | Mapping[str, Any] | tuple[float, ...] | None
+    norm: Literal["linf", "l2"] | None
+    estimators: str | Mapping[str, str]
+    ensemble: Literal["mean", "worst"] | None
+    measure: Literal["no", "quick", "full"]
+    steps: int | None
+    seconds: float | None
+    target: Path | Names | None
+    minimise: bool
+    smallest: bool
+    printable: bool
+    draws: int | None
+    average: int
+    baseline: bool
+    trials: int | None
+
 
 @asks(AttackConfig)
 def attack(
@@ -51,7 +75,7 @@ def attack(
     run: str | Path | None = None,
     resume: bool = False,
     progress: Watched = None,
-    **settings: Any,
+    **settings: Unpack[AttackKeywords],
 ) -> AttackResult:
     """Search for the worst configuration of a scene, verify it, and return everything that is known about it.
 
@@ -78,7 +102,7 @@ def attack(
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
     """
-    options = {name: value for name, value in settings.items() if value is not None}
+    options: dict[str, Any] = {name: value for name, value in settings.items() if value is not None}
     task = make_task(task) if callable(task) else task
     loaded_already = not all(isinstance(network, (str, Path)) for network in (scene, *several(model)))
     own_controls = [*loading.only_here(controls), *loading.only_here(over)]
@@ -94,9 +118,9 @@ def attack(
             f"policy: expected a name, a mapping with a `name` and options, or an instance, got {told(policy)}"
         )
     if isinstance(scene, Scene):
-        naming.check_not_of_scene({**settings, "object": object})
+        naming.check_not_of_scene({**options, "object": object})
     else:
-        of_scene = {name: settings[name] for name in naming.OF_SCENE if name in settings}
+        of_scene = {name: options[name] for name in naming.OF_SCENE if name in options}
         place = SceneConfig(**{"object": "mug", **of_scene})
         light, more = place.environment, naming.told_of_scene(place)
         if object is not None:
@@ -108,7 +132,7 @@ def attack(
     own_name = str(getattr(objective, "__name__", None) or type(objective).__name__)  # where it is the caller's
     own_name = f"own {own_name}" if own_name in OBJECTIVE_KINDS else own_name  # never as one of ours
     fixed: dict[str, float | str] = scene.description.given_values
-    if settings.get("exposure"):  # the option says it
+    if options.get("exposure"):  # the option says it
         fixed.pop("camera.exposure", None)
     described = {
         **loading.scene_as_settings(scene),
