@@ -104,61 +104,101 @@ def attack(
     """
     options: dict[str, Any] = {name: value for name, value in settings.items() if value is not None}
     task = make_task(task) if callable(task) else task
-    loaded_already = not all(isinstance(network, (str, Path)) for network in (scene, *several(model)))
-    own_controls = [*loading.only_here(controls), *loading.only_here(over)]
-    if loaded_already or callable(objective) or own_controls or isinstance(task, OwnTask):
-        naming.check_not_spread(options)
-
-    def policy_of(setting: Any) -> Policy[Any]:
-        asked = AttackConfig(object="mug", policy=setting)
-        return make_policy(asked.policy_name, **asked.policy_options)
-
     if not isinstance(policy, (str, Mapping, Policy)) or not policy:
         raise InputError(
             f"policy: expected a name, a mapping with a `name` and options, or an instance, got {told(policy)}"
         )
-    if isinstance(scene, Scene):
-        naming.check_not_of_scene({**options, "object": object})
-    else:
-        of_scene = {name: options[name] for name in naming.OF_SCENE if name in options}
-        place = SceneConfig(**{"object": "mug", **of_scene})
-        light, more = place.environment, naming.told_of_scene(place)
-        if object is not None:
-            scene = loading.load_scene(object, light, scene=scene, **more)
-        elif isinstance(scene, Mapping):
-            raise InputError("object: which shape of the scene is it? Give its id")
-        else:
-            scene = loading.load_scene(scene, light, **more)
-    own_name = str(getattr(objective, "__name__", None) or type(objective).__name__)  # where it is the caller's
-    own_name = f"own {own_name}" if own_name in OBJECTIVE_KINDS else own_name  # never as one of ours
-    fixed: dict[str, float | str] = scene.description.given_values
-    if options.get("exposure"):  # the option says it
-        fixed.pop("camera.exposure", None)
+    own_controls = [*loading.only_here(controls), *loading.only_here(over)]
+    are_named = all(isinstance(named, (str, Path)) for named in (scene, *several(model)))
+    if not are_named or callable(objective) or own_controls or isinstance(task, OwnTask):
+        naming.check_not_spread(options)
+    scene = _load_scene(scene, object, options)
+
+    # What `run.yaml` states. Objects of the caller have the names that they are shown by.
+    objective_name = _name_objective(objective) if callable(objective) else objective
     described = {
         **loading.scene_as_settings(scene),
         "model": ",".join(map(model_name, several(model))),
         "controls": loading.settings_of(controls),
         "over": loading.settings_of(over),
         "task": as_setting(task) if isinstance(task, Task) else task,
-        "objective": own_name if callable(objective) else objective,
+        "objective": objective_name,
         "policy": as_setting(policy) if isinstance(policy, Policy) else policy,
-        "set": fixed,
         "metrics": judging.metrics_as_settings(metrics or {}),
     }
+    if options.get("exposure"):  # the option says it
+        described["set"].pop("camera.exposure", None)
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     losses.check_aim(objective, targeted=config.target is not None)
-    parts = [PythonOnly("model", model_name(network)) for network in several(model) if naming.exists_here(network)]
-    parts += [PythonOnly("scene")] if scene.only_here else []
-    parts += [PythonOnly("task", task.name)] if isinstance(task, Task) and not is_named(task, make_task) else []
-    parts += [PythonOnly("objective", own_name)] if callable(objective) else []
-    parts += (
-        [PythonOnly("policy", policy.name)] if isinstance(policy, Policy) and not is_named(policy, policy_of) else []
+
+    only_here = [PythonOnly("model", model_name(network)) for network in several(model) if naming.exists_here(network)]
+    only_here += [PythonOnly("scene")] if scene.only_here else []
+    if isinstance(task, Task) and not is_named(task, make_task):
+        only_here.append(PythonOnly("task", task.name))
+    only_here += [PythonOnly("objective", str(objective_name))] if callable(objective) else []
+    if isinstance(policy, Policy) and not is_named(policy, _make_policy):
+        only_here.append(PythonOnly("policy", policy.name))
+    only_here += [PythonOnly("control", name) for name in own_controls]
+    only_here += [PythonOnly("metric", name) for name in judging.only_here(config.metrics)]
+    config = config.with_only_here(only_here)
+    _check_single(config)
+
+    searched, drawn = controls_given(config, controls, over)
+    if not isinstance(policy, Policy):
+        policy = make_policy(config.policy_name, **config.policy_options)
+    loaded_task, objective = task_and_objective(
+        config, task if isinstance(task, Task) else config.task, objective if callable(objective) else config.objective
     )
-    parts += [PythonOnly("control", name) for name in own_controls]
-    parts += [PythonOnly("metric", name) for name in judging.only_here(config.metrics)]
+    stopped = run_path(run) if resume and run is not None and is_run(run_path(run)) else None
+    with begun(config) if run is not None and stopped is None else nullcontext(stopped) as folder:
+        parts = AttackParts(
+            config,
+            scene,
+            loaded=models_as_one(model, config, loaded_task),
+            task=loaded_task,
+            controls=searched,
+            over=drawn,
+            objective=objective,
+            policy=policy,
+            keep=run is not None,
+            metrics=judging.load_metrics(config.metrics, metrics),
+        )
+        return run_attack(parts, watcher(progress), folder)
+
+
+def _load_scene(
+    scene: Scene | str | Path | Mapping[str, object], shape: str | None, options: Mapping[str, Any]
+) -> Scene:
+    """Return a scene, loaded with the options that belong to it; `shape` is its object where it holds several."""
+    if isinstance(scene, Scene):
+        naming.check_not_of_scene({**options, "object": shape})
+        return scene
+    of_scene = {name: options[name] for name in naming.OF_SCENE if name in options}
+    config = SceneConfig(**{"object": "mug", **of_scene})
+    environment, keywords = config.environment, naming.told_of_scene(config)
+    if shape is not None:
+        return loading.load_scene(shape, environment, scene=scene, **keywords)
+    if isinstance(scene, Mapping):
+        raise InputError("object: which shape of the scene is it? Give its id")
+    return loading.load_scene(scene, environment, **keywords)
+
+
+def _name_objective(objective: Callable[..., Tensor]) -> str:
+    """Name an objective of the caller, never as one of the built-in ones."""
+    name = str(getattr(objective, "__name__", None) or type(objective).__name__)
+    return f"own {name}" if name in OBJECTIVE_KINDS else name
+
+
+def _make_policy(setting: Any) -> Policy[Any]:
+    """Make the policy that a setting names."""
+    config = AttackConfig(object="mug", policy=setting)
+    return make_policy(config.policy_name, **config.policy_options)
+
+
+def _check_single(config: AttackConfig) -> None:
+    """Refuse settings of several attacks, and those that need a run directory or workers and cannot have them."""
     if config.workers is not None or config.cluster is not None:
         judging.check_shared(config.metrics)
-    config = config.with_only_here(parts)
     if config.is_matrix and config.ensemble is None:
         raise InputError(
             "model: expected one, got several; add `ensemble`, which attacks them together, or attack each by itself"
@@ -170,14 +210,3 @@ def attack(
         )
     if config.aov is not None and config.run is None:
         raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
-    searched, drawn = controls_given(config, controls, over)
-    if not isinstance(policy, Policy):
-        policy = make_policy(config.policy_name, **config.policy_options)
-    named = config.objective if objective is None or isinstance(objective, str) else objective
-    asked, objective = task_and_objective(config, task if isinstance(task, Task) else config.task, named)
-    stopped = run_path(run) if resume and run is not None and is_run(run_path(run)) else None
-    with begun(config) if run is not None and stopped is None else nullcontext(stopped) as folder:
-        loaded = models_as_one(model, config, asked)
-        measured = judging.load_metrics(config.metrics, metrics)
-        job = AttackParts(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None, measured)
-        return run_attack(job, watcher(progress), folder)
