@@ -4,17 +4,50 @@
     model = advsearch.load_model("reference")
     result = advsearch.attack(scene, model, controls=["texture"])
 
-Nothing heavy is imported until one of these is used. Editors and type checkers read `__init__.pyi`, which
-`tools/stubs.py` makes.
+Nothing heavy is imported until one of these is used. Editors and type checkers read the block of imports; of the
+experiments other than `attack`, `sweep` and `render` the class of settings documents the keywords.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from advsearch.catalog import list_built_ins
 from advsearch.registry import EXPERIMENTS, get_experiment
+
+if TYPE_CHECKING:
+    from advsearch import controls as controls
+    from advsearch import losses as losses
+    from advsearch import maite as maite
+    from advsearch import testing as testing
+    from advsearch.api.chart import measured_palette as measured_palette
+    from advsearch.api.render import load_model as load_model
+    from advsearch.api.render import load_run as load_run
+    from advsearch.attacks import Policy as Policy
+    from advsearch.controls.base import Control as Control
+    from advsearch.engine.loading import Scene as Scene
+    from advsearch.engine.loading import load_scene as load_scene
+    from advsearch.engine.rendering import Rendering as Rendering
+    from advsearch.engine.rendering import render as render
+    from advsearch.models import Model as Model
+    from advsearch.questions.attack.python import attack as attack
+    from advsearch.questions.attack.result import AttackResult as AttackResult
+    from advsearch.questions.check import check as check
+    from advsearch.questions.compare import compare as compare
+    from advsearch.questions.explain import explain as explain
+    from advsearch.questions.harden import harden as harden
+    from advsearch.questions.photographs.carry_out import photo_agreement as photo_agreement
+    from advsearch.questions.precision import precision as precision
+    from advsearch.questions.recipe import recipe as recipe
+    from advsearch.questions.region import region as region
+    from advsearch.questions.replay import replay as replay
+    from advsearch.questions.stability import stability as stability
+    from advsearch.questions.sweep.carry_out import sweep as sweep
+    from advsearch.questions.sweep.result import SweepResult as SweepResult
+    from advsearch.questions.test import test as test
+    from advsearch.tasks import Task as Task
+    from advsearch.trust.code import allow_code as allow_code
 
 __version__ = "0.1.0"
 
@@ -39,17 +72,21 @@ _MODULES = ("controls", "losses", "maite", "testing")  # public modules
 __all__ = sorted({*_HOMES, *_MODULES, *list_built_ins("experiment")})
 
 
-def __getattr__(name: str) -> Any:
-    """Import the interface on first use (PEP 562)."""
-    if name in _MODULES or name in _HOMES:
-        import_module("advsearch.api")  # sets the threads before torch is imported
-        return import_module(f"advsearch.{name}") if name in _MODULES else getattr(import_module(_HOMES[name]), name)
-    if name.isidentifier() and not name.startswith("_") and name in EXPERIMENTS:
-        import_module("advsearch.api")
-        return get_experiment(name).python
-    if name == "plan":
-        raise AttributeError("`plan` is a part of `check` now: use advsearch.check(..., loss='model')")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+if not TYPE_CHECKING:  # else a checker would take any name
+
+    def __getattr__(name: str) -> Any:
+        """Import the interface on first use (PEP 562)."""
+        if name in _MODULES or name in _HOMES:
+            import_module("advsearch.api")  # sets the threads before torch is imported
+            return (
+                import_module(f"advsearch.{name}") if name in _MODULES else getattr(import_module(_HOMES[name]), name)
+            )
+        if name.isidentifier() and not name.startswith("_") and name in EXPERIMENTS:
+            import_module("advsearch.api")
+            return get_experiment(name).python
+        if name == "plan":
+            raise AttributeError("`plan` is a part of `check` now: use advsearch.check(..., loss='model')")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -282,6 +282,16 @@ class SceneConfig(Config):
         return self.spp if isinstance(self.spp, int) else SEARCH_SPP[self.denoise]
 
     @property
+    def image_settings(self) -> dict[str, Any]:
+        """Keywords of `render` for the images that the models see."""
+        return {
+            "resolution": self.resolution,
+            "denoise": self.denoise,
+            "sampler": self.pixel_sampler,
+            "seed": self.seed,
+        }
+
+    @property
     def close_looks(self) -> int:
         """Renders more of a search's best configurations, at most, while it is close between them."""
         return CLOSE_LOOKS if self.spp == "auto" else 0

@@ -289,7 +289,7 @@ class Experiment(Generic[AnyResult]):
         return self._make_python_function()
 
     def _make_python_function(self) -> Callable[..., Any]:
-        from advsearch.api.keywords import asks, configured, name_loaded  # imports torch
+        from advsearch.api.keywords import asks, configured  # imports torch
 
         kinds = inspect.Parameter
         own = self._find_python_arguments()
@@ -298,7 +298,7 @@ class Experiment(Generic[AnyResult]):
             given = {**dict(zip(self.positional_args, args, strict=False)), **settings}
             arguments = {name: given[name] for name in own if name in given}
             given = {name: value for name, value in given.items() if name not in own or name in self.positional_args}
-            config = configured(self.settings, **name_loaded(given, own))
+            config = configured(self.settings, **given)
             resumed = find_stopped_run(config) if resume else None
             return self.run(config, progress=watcher(progress), resumed=resumed, **arguments)
 

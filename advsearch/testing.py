@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -150,22 +149,22 @@ def _asserted(
     loading = workbench.loading
     experiment = get_experiment("test")
     name = str(claim["claim"]).replace("_", "-")
-    with ExitStack() as stack:
-        stack.enter_context(workbench.in_turn())
+    objects: dict[tuple[str, str], Any] = {}
+    with workbench.in_turn():
         for named in (settings, *({"model": one} for one in models.values())):
             workbench.allow_named(named)
         given, said = dict(settings), dict(claim)
         if isinstance(object, loading.Scene):
             given |= {key: value for key, value in loading.scene_as_settings(object).items() if value is not None}
-            stack.enter_context(loading.lending(loading.SCENE, {given["object"]: object}))
+            objects["scene", given["object"]] = object
         else:
             given["object"] = str(object)
         for key, model in models.items():
             (given if key == "model" else said)[key] = workbench.model_name(model)
             if not isinstance(model, (str, Path)):
-                stack.enter_context(loading.lending(loading.MODEL, {workbench.model_name(model): model}))
+                objects["model", workbench.model_name(model)] = model
         if instances := loading.instances_in(given.get("controls", ())):
-            stack.enter_context(loading.lending(loading.CONTROL, {one.name: one for one in instances}))
+            objects |= {("control", control.name): control for control in instances}
             given["controls"] = loading.settings_of(given["controls"])
         title = f"assert_{claim['claim']}"
         values = {"title": title, "settings": given, "seed": seed, "confidence": confidence, "claims": {name: said}}
@@ -176,7 +175,7 @@ def _asserted(
             if workbench.exists_here(model)
         ]
         config = experiment.settings(suite=title, run=None if run is None else str(run)).with_only_here(only_here)
-        result: SuiteResult = experiment.run(config, suite=values)
+        result: SuiteResult = experiment.run(config.with_python_objects(objects), suite=values)
     (claimed,) = result.claims
     if claimed.answer != "held":
         test = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[0]

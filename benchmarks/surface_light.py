@@ -56,7 +56,7 @@ from advsearch.engine.acceptance import VIEWS, ComparedView, Deviation, compared
 from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.models import Model, load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
-from advsearch.questions.attack.carry_out import attack_once  # noqa: E402
+from advsearch.questions.attack.run import attack_once  # noqa: E402
 from advsearch.questions.attack.settings import AttackConfig  # noqa: E402
 from advsearch.questions.recipe.description import planned, read_recipe  # noqa: E402
 from advsearch.questions.recipe.result import RecipeConfig  # noqa: E402

@@ -32,15 +32,15 @@ import torch
 from scipy.special import ndtr, ndtri
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult, make_policy
+from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult
 from advsearch.attacks.candidates import Failures, FoundFailure
-from advsearch.attacks.trials import choose_rate_spp
-from advsearch.attacks.verification import OVER_CONDITIONS, WORST_CASE, Rule
+from advsearch.attacks.trials import LADDER, choose_rate_spp
+from advsearch.attacks.verification import OVER_CONDITIONS, OVER_LOOKS, TRIAL_LOOKS, WORST_CASE, Rule
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.record import Findings
+from advsearch.engine.verifier import Verifier
 from advsearch.progress import NullProgress, Stages
-from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.stages import Attack
+from advsearch.questions.attack.stages import verify_searches
 from advsearch.tasks import Judgement, Prediction
 
 RATE, OVER_RATE = 0.75, 0.85
@@ -110,14 +110,14 @@ def claimed(at: float, failures: Failures | None = None) -> SearchResult:
 def checked(rate: float, root: int, *, over: bool = False, beside: bool = True, failures: int = 0) -> Findings:
     """Return what an attack's own check comes to, with a random search `beside` it, and so many different failures."""
     problem: Any = Drawn(rate, root, over)
-    config = AttackConfig(object="mug", controls={"texture": {}}, measure="no")
-    attack = Attack(Journal(None, Shared(problem)), config, make_policy("auto"), Stages(NullProgress()))
+    looks = OVER_LOOKS if over else TRIAL_LOOKS
+    verifier = Verifier(Journal(None, Shared(problem)), LADDER, Stages(NullProgress()), looks=looks)
     listed = tuple(FoundFailure(torch.full((1,), FAILURE + 0.01 * k), 1.0, {}) for k in range(failures))
     known = Failures(listed, (0,), failures, failures, failures) if failures else None
-    attack.findings.search = claimed(OWN, known)
-    attack.findings.baseline = claimed(BASELINE) if beside else None
-    attack.verify()
-    return attack.findings
+    verifier.findings.search = claimed(OWN, known)
+    verifier.findings.baseline = claimed(BASELINE) if beside else None
+    verify_searches(verifier, is_smallest=False)
+    return verifier.findings
 
 
 def flow(rate: float, runs: int, *, over: bool = False, beside: bool = True) -> tuple[float, float, float]:

@@ -8,14 +8,16 @@ from typing import Any
 import griffe
 
 import advsearch
+from advsearch.catalog import list_built_ins
 
 
 class KeywordsOfSettings(griffe.Extension):  # type: ignore[misc]
-    """Takes signature and docstring of the functions that `advsearch/__init__.pyi` declares from these themselves."""
+    """Takes signature and docstring of the experiments' functions from these themselves."""
 
     def on_function(self, *, func: griffe.Function, **rest: Any) -> None:
-        """Replace both, where a function is declared there."""
-        if func.parent is None or func.parent.path != "advsearch" or func.name.startswith("_"):
+        """Replace both, where a function is that of an experiment."""
+        home = "" if func.parent is None else func.parent.path
+        if func.name not in list_built_ins("experiment") or not home.startswith("advsearch.questions."):
             return
         function = getattr(advsearch, func.name)
         parameters = inspect.signature(function).parameters.values()

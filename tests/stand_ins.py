@@ -20,11 +20,12 @@ from advsearch.cluster import BatchResult, InProcess, WorkerStats, WorkerTask
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings
+from advsearch.engine.verifier import ladder_of
 from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack.carry_out import attack_worker, search_size
+from advsearch.questions.attack.run import search_and_verify
 from advsearch.questions.attack.settings import AttackConfig
-from advsearch.questions.attack.stages import Attack
 from advsearch.runs.directory import RunDirectory
 from advsearch.tasks import Classification, Judgement
 
@@ -106,11 +107,19 @@ def attack_on(
     policy: Policy[Any],
     stages: Stages,
     run: RunDirectory | None = None,
-) -> Attack:
-    """An attack as a configuration describes it, on a problem of one's own."""
-    journal = Journal(run, Shared(problem))
+) -> Findings:
+    """Attack a problem of one's own as a configuration describes it."""
     problem.steps, problem.draws = search_size(config, problem)
-    return Attack(journal, config, policy, stages)
+    return search_and_verify(
+        policy,
+        Journal(run, Shared(problem)),
+        stages,
+        average=config.average,
+        trials=config.trials,
+        ladder=ladder_of(config.verify_spp, config.pixel_sampler),
+        specialise=config.specialise,
+        measure=config.measure,
+    )
 
 
 def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume: bool = False) -> Findings:
@@ -118,7 +127,7 @@ def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume:
     problem: Any = StandInProblem(pause)
     with RunDirectory.resume(folder) if resume else RunDirectory.create(folder, config=config) as run:
         stages = Stages(NullProgress())
-        findings = attack_on(problem, config, make_policy(config.policy_name), stages, run).carry_out()
+        findings = attack_on(problem, config, make_policy(config.policy_name), stages, run)
         if not findings.interrupted:
             run.store.forget()
         return findings

@@ -1,8 +1,8 @@
-"""The settings of each question as keywords: what Python callers may write for them.
+"""The settings of each experiment as keywords: what Python callers may write for them.
 
 A setting is declared once: its default, its range, what it is. In Python more may be written for it than the text of a
-file (`hint_of`). Signatures and docstrings are made from both (`asks`), and of these what type checkers read
-(`tools/stubs.py`).
+file (`hint_of`). Signatures and docstrings are made from both (`asks`). Type checkers read the keywords of `attack` and
+`sweep` in code: `SceneKeywords` and its subclasses.
 """
 
 from __future__ import annotations
@@ -10,18 +10,28 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import wraps
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar
 
+import numpy as np
 from torch import nn
 
 from advsearch.calls import check_types, unexpected
 from advsearch.config import SEVERAL
 from advsearch.engine import loading
-from advsearch.engine.naming import check_not_of_scene, check_not_spread, exists_here, in_turn, model_name
+from advsearch.engine.naming import (
+    CONTROL,
+    MODEL,
+    SCENE,
+    check_not_of_scene,
+    check_not_spread,
+    exists_here,
+    in_turn,
+    model_name,
+)
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import told
@@ -31,7 +41,43 @@ from advsearch.trust.code import allow_named
 from advsearch.trust.stored_files import is_shallow
 
 Names = str | Sequence[str]  # names in a list, or in a text with commas between them
-LOADED = (loading.Scene, Model, nn.Module)  # what a question may be given in place of a name
+
+
+class SceneKeywords(TypedDict, total=False):
+    """Settings that `attack` and `sweep` both take as keywords; their docstrings say what each is."""
+
+    environment: Path | Names | None
+    up: Literal["y", "z"] | None
+    facing: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None
+    size: float | None
+    unit: Literal["mm", "cm", "m", "in"] | None
+    camera: str | Path | None
+    set: Mapping[str, float | str | Sequence[float]] | None
+    things: str | Path | None
+    judge: str | Path
+    exposure: float
+    resolution: int | str | tuple[int, int] | None
+    labels: Path | Names | None
+    prompt: Path | Names | None
+    value_range: str | Sequence[float] | None
+    ask: Mapping[str, Any]
+    label: int | np.integer[Any] | Names | None
+    texture_resolution: int | None
+    denoise: Literal["oidn", "none"]
+    pixel_sampler: Literal["independent", "multijitter"]
+    seed: int
+    threads: int | None
+    deterministic: bool
+    overwrite: bool
+    specialise: bool
+    aov: str | Path | None
+    log: Literal["mlflow", "tensorboard", "wandb"] | None
+    path: str | Path | None
+    shutter: float | None
+    rolling: float | None
+    verify_spp: int | None
+    workers: int | None
+    cluster: str | Path | None
 
 
 class _Signature(inspect.Signature):
@@ -104,28 +150,6 @@ def asks(config: type[Config]) -> Callable[[Function], Function]:
                             f"{key}: expected a name for {function.__name__}, got {told(plain[key])}; `attack` "
                             "takes your own, and `sweep` a task of your own"
                         )
-                for key in {"controls", "over"} & plain.keys() - own.parameters.keys():
-                    if loading.instances_in(plain[key]) or isinstance(plain[key], Mapping):
-                        if loading.only_here(plain[key]):
-                            check_not_spread(plain)
-                        instances = {control.name: control for control in loading.instances_in(plain[key])}
-                        stack.enter_context(loading.lending(loading.CONTROL, instances))
-                        plain[key] = loading.settings_of(plain[key])
-                if "object" in own.parameters and "scene" not in own.parameters:
-                    # a scene and a model are lent, and the settings name them
-                    loaded = [value for value in bound.arguments.values() if isinstance(value, LOADED)]
-                    if loaded:
-                        check_not_spread(plain)
-                        args, plain = (), {**dict(zip(own.parameters, args, strict=False)), **plain}
-                    for value in loaded:
-                        if isinstance(value, loading.Scene):
-                            check_not_of_scene({name: plain[name] for name in plain if name != "object"})
-                            described = loading.scene_as_settings(value).items()
-                            plain |= {name: setting for name, setting in described if setting is not None}
-                            stack.enter_context(loading.lending(loading.SCENE, {plain["object"]: value}))
-                        else:
-                            plain["model"] = model_name(value)
-                            stack.enter_context(loading.lending(loading.MODEL, {plain["model"]: value}))
                 return function(*args, **plain)
 
         asked.__doc__ = _docstring(function.__doc__ or "", [one.name for one in plain], config.command, lines)
@@ -169,20 +193,36 @@ def _docstring(text: str, names: Sequence[str], command: str, settings: Sequence
     return f"{said}\n\nArgs:\n{textwrap.indent(chr(10).join(listed), '    ')}\n\nRaises:\n    {RAISED}"
 
 
-def name_loaded(settings: Mapping[str, Any], python_arguments: Collection[str]) -> dict[str, Any]:
-    """Return settings with the name of a loaded model in its place, where the model is passed beside them too."""
-    named = dict(settings)
-    if "model" in python_arguments and "model" in named and not isinstance(named["model"], (str, Path)):
-        check_not_spread(named)
-        named["model"] = model_name(named["model"])
-    return named
+def configured(config: type[Made], **given: Any) -> Made:
+    """Return a configuration of settings as Python has them; None is one that was not given.
 
+    A scene, a model and controls may be objects: the settings name them, hold them (`Config.python_object`), and know
+    which of them exist only in this session.
+    """
+    settings = {name: value for name, value in given.items() if value is not None}
+    objects: dict[tuple[str, str], Any] = {}
+    only_here: list[PythonOnly] = []
 
-def configured(config: type[Made], **given: object) -> Made:
-    """Return a configuration of settings as Python has them; None is one that was not given."""
-    made = config(**{name: value for name, value in given.items() if value is not None})
-    parts = [PythonOnly("model", model_name(one)) for one in loading.all_lent(loading.MODEL) if exists_here(one)]
-    parts += [PythonOnly("scene")] if any(one.only_here for one in loading.all_lent(loading.SCENE)) else []
-    return made.with_only_here(
-        [*parts, *(PythonOnly("control", name) for name in loading.only_here(loading.all_lent(loading.CONTROL)))]
-    )
+    scene, model = settings.get("object"), settings.get("model")
+    if isinstance(scene, loading.Scene) or isinstance(model, (Model, nn.Module)):
+        check_not_spread(settings)
+    if isinstance(model, (Model, nn.Module)):
+        settings["model"] = model_name(model)
+        objects[MODEL, settings["model"]] = model
+        only_here += [PythonOnly("model", settings["model"])] if exists_here(model) else []
+    if isinstance(scene, loading.Scene):
+        check_not_of_scene({name: value for name, value in settings.items() if name != "object"})
+        described = loading.scene_as_settings(scene)
+        settings |= {name: value for name, value in described.items() if value is not None}
+        objects[SCENE, settings["object"]] = scene
+        only_here += [PythonOnly("scene")] if scene.only_here else []
+    for name in ("controls", "over"):
+        controls: Any = settings.get(name)
+        instances = loading.instances_in(controls)
+        if instances or isinstance(controls, Mapping):
+            if loading.only_here(controls):
+                check_not_spread(settings)
+            objects |= {(CONTROL, control.name): control for control in instances}
+            only_here += [PythonOnly("control", kind) for kind in loading.only_here(instances)]
+            settings[name] = loading.settings_of(controls)
+    return config(**settings).with_python_objects(objects).with_only_here(only_here)

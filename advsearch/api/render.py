@@ -22,7 +22,7 @@ from advsearch.config import RenderConfig
 from advsearch.engine import rendering
 from advsearch.engine.naming import check_run_settings, given_to, in_turn, load_models, scene_of
 from advsearch.engine.rendering import Rendering as Rendering
-from advsearch.engine.rendering import pictures_of, writable
+from advsearch.engine.rendering import writable
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.progress import NullProgress, Progress, shows_progress
@@ -141,7 +141,7 @@ def render_picture_file(config: RenderConfig, *, progress: Progress | None = Non
         spp=config.spp,
         aov=bool(aovs),
         progress=progress,
-        **pictures_of(config),
+        **config.image_settings,
     )
     warnings = [*rendering.warnings, *notes]
     for text in warnings:

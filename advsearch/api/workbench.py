@@ -67,7 +67,6 @@ from advsearch.progress import watcher as watcher
 from advsearch.questions.attack.carry_out import LOADING as LOADING
 from advsearch.questions.attack.carry_out import ROLES_IN_SEARCH as ROLES_IN_SEARCH
 from advsearch.questions.attack.carry_out import AttackParts as AttackParts
-from advsearch.questions.attack.carry_out import attack_on as attack_on
 from advsearch.questions.attack.carry_out import check_from_config as check_from_config
 from advsearch.questions.attack.carry_out import executor_for as executor_for
 from advsearch.questions.attack.carry_out import judged_alone as judged_alone
@@ -78,6 +77,7 @@ from advsearch.questions.attack.carry_out import problem_of as problem_of
 from advsearch.questions.attack.carry_out import problem_of_parts as problem_of_parts
 from advsearch.questions.attack.carry_out import problem_on as problem_on
 from advsearch.questions.attack.result import AttackResult as AttackResult
+from advsearch.questions.attack.run import attack_on as attack_on
 from advsearch.questions.attack.summary import AttackSummary as AttackSummary
 from advsearch.questions.attack.summary import attack_of as attack_of
 from advsearch.questions.sweep.carry_out import row_parameters as row_parameters

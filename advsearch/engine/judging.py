@@ -19,12 +19,11 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, Objective, get_objective
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, More, labels_of, nothing_more
-from advsearch.config import SceneConfig
 from advsearch.controls import Space
 from advsearch.controls.base import Control
 from advsearch.copies import copied
 from advsearch.engine.loading import Scene
-from advsearch.engine.rendering import facts_about, pictures_of, render
+from advsearch.engine.rendering import render
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonObject
 from advsearch.models import Model
@@ -186,37 +185,48 @@ Looked = Callable[[], Surfaces]
 """What says what the camera sees, when it is asked."""
 
 
-def facts_of(scene: Scene, name: str, config: SceneConfig, describe: Described, look: Looked | None = None) -> Facts:
-    """Return what a scene gives a task to judge by, with what the settings say; see `facts_about`."""
-    return facts_about(scene.description, name, config.label, describe, look, config.judge)
+def calibrate_task(
+    task: Task, model: Model, scenes: Sequence[Scene], label: str | None, judge: str, image_settings: Mapping[str, Any]
+) -> Task:
+    """Return the task after it has seen what its model predicts of clean images, where it `calibrates`.
 
+    The next scene is rendered where those before leave open how predictions are to be read.
 
-def shown(task: Task, model: Model, scenes: Sequence[Scene], config: SceneConfig) -> Task:
-    """Return the task after it has seen what its model predicts of clean pictures, where it asks for that
-    (`calibrates`). The next scene is shown where those before leave open how predictions are to be read."""
+    Args:
+        task: of the model.
+        model: whose predictions are read.
+        scenes: in order.
+        label: what is right; None for the label of each object.
+        judge: the thing that is judged.
+        image_settings: keywords of `render` for the images that the model sees, see `SceneConfig.image_settings`.
+    """
     if not task.calibrates:
         return task
     for scene in scenes:
-        judge = OBJECT if config.judge == ALL else config.judge
-        view = render(
-            scene, model, task=task, label=config.label, judge=judge, spp=LOOK_SPP, **pictures_of(config)
-        ).views[0]
+        rendering = render(
+            scene, model, task=task, label=label, judge=OBJECT if judge == ALL else judge, spp=LOOK_SPP,
+            **image_settings,
+        )  # fmt: skip
+        view = rendering.views[0]
         task = task.after_calibration(view.output, view.truth)
         if not task.ambiguities:
             return task
     raise InputError(f"model {model.name}: {task.ambiguities}")
 
 
-def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: SceneConfig) -> None:
-    """Refuse a scene of which the task cannot say what is right, before anything is prepared; where no label was given,
-    with the model's first predictions of a clean picture."""
+def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, image_settings: Mapping[str, Any]) -> None:
+    """Refuse a scene of which the task cannot say what is right, before anything is prepared.
+
+    Where no label is stated, the message has the model's first predictions of a clean image; `image_settings` as for
+    `calibrate_task`.
+    """
     try:
         for each in facts.each.values() or (facts,):
             task.check(each)
     except InputError as error:
         if facts.label is not None:
             raise
-        predictions = render(scene, model, task=task, spp=LOOK_SPP, **pictures_of(config)).views[0].predictions
+        predictions = render(scene, model, task=task, spp=LOOK_SPP, **image_settings).views[0].predictions
         said = ", ".join(seen_text(task.name, replace(each, label=repr(each.label))) for each in predictions)
         term = f"#{predictions[0].index}"
         with suppress(InputError):  # the label, where that names this class and no other

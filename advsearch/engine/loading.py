@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, ValuesView
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Collection, Iterable, Mapping, Sequence, ValuesView
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, final
 
 import numpy as np
@@ -51,7 +48,6 @@ its instance, and ``mitsuba:KEY`` a range."""
 
 Texture = str | Path | npt.ArrayLike | Tensor
 
-CONTROL, SCENE, MODEL = "control", "scene", "model"  # kinds of things that may stand for a name (`lent`)
 DEFAULT_RESOLUTION = 128
 
 
@@ -307,7 +303,7 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
     for name in ready:
         if named[name]:
             raise InputError(f"controls: {name} is given twice, by an instance and by name; say all of it in one")
-    return tuple(ready.get(name) or lent(CONTROL, name) or make_control(name, given) for name, given in named.items())
+    return tuple(ready.get(name) or make_control(name, given) for name, given in named.items())
 
 
 def controls_by_name(controls: Controls) -> dict[str, Control | Mapping[str, object]]:
@@ -347,28 +343,6 @@ def instances_in(controls: object) -> list[Control]:
     listed = controls.values() if isinstance(controls, Mapping) else controls
     listed = listed if isinstance(listed, (list, tuple, ValuesView)) else [listed]
     return [control for control in listed if isinstance(control, Control)]
-
-
-_LENT: ContextVar[Mapping[tuple[str, str], Any]] = ContextVar("lent", default=MappingProxyType({}))
-
-
-def lent(kind: str, name: str) -> Any:
-    """Return what stands for a name where only names are told; None if nothing does."""
-    return _LENT.get().get((kind, name))
-
-
-def all_lent(kind: str) -> list[Any]:
-    return [one for (of, _), one in _LENT.get().items() if of == kind]
-
-
-@contextmanager
-def lending(kind: str, things: Mapping[str, Any]) -> Iterator[None]:
-    """Let things be what their names stand for inside the block, where only names are told; see `lent`."""
-    token = _LENT.set({**_LENT.get(), **{(kind, name): one for name, one in things.items()}})
-    try:
-        yield
-    finally:
-        _LENT.reset(token)
 
 
 def only_here(controls: Controls) -> list[str]:

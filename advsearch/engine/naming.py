@@ -15,7 +15,7 @@ from torch import nn
 from advsearch import threads
 from advsearch.config import SceneConfig
 from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
-from advsearch.engine.loading import CONTROL, MODEL, Controls, Scene, as_controls, controls_by_name, lent, load_scene
+from advsearch.engine.loading import Controls, Scene, as_controls, controls_by_name, load_scene
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.all_at_once import AllAtOnce
@@ -27,10 +27,19 @@ from advsearch.tasks import Task
 from advsearch.tasks.together import Together, together
 from advsearch.trust.foreign_code import plainly
 
+CONTROL, MODEL, SCENE = "control", "model", "scene"
+"""Roles of objects that a Python caller may pass in place of a name."""
+
 
 def scene_of(config: SceneConfig, name: str | None = None, environment: str | None = None) -> Scene:
-    """Load the scene that a configuration describes: its only object in its environment, or a named one."""
+    """Load the scene that a configuration describes: its only object in its environment, or a named one.
+
+    A scene that a Python caller passed is returned as it is.
+    """
     if name is None:
+        scene: Scene | None = config.python_object(SCENE, config.object)
+        if scene is not None:
+            return scene
         name, environment = config.object, config.environment
     return load_scene(name, environment, **told_of_scene(config))
 
@@ -72,7 +81,8 @@ def load_models(models: Sequence[Any], task: Task, config: SceneConfig) -> tuple
         part = of.of_one_image
         told = of is task or (part.labelled and not part.names_from)
         labels, prompt = (config.labels, config.prompt) if told else (None, None)
-        model = (lent(MODEL, model) if isinstance(model, str) else None) or model
+        if isinstance(model, str):
+            model = config.python_object(MODEL, model) or model
         return load_model(
             model, labels=labels, prompt=prompt, value_range=config.value_range, task=part, ask=config.ask
         )
@@ -155,21 +165,29 @@ RUN_SETTINGS = ("epsilon", "norm", "texture_resolution", "path", "shutter", "rol
 A configuration without such a setting counts as one that does not say it."""
 
 
-def given_to(config: SceneConfig, controls: Controls) -> tuple[Control, ...]:
-    """Return control instances, with what they take of the configuration where they say nothing themselves."""
-    asked = controls_by_name(controls)
-    as_controls(controls)  # refuses what is none
+def given_to(config: SceneConfig, controls: Controls, *, are_searched: bool = True) -> tuple[Control, ...]:
+    """Return control instances, with what they take of the configuration where they say nothing themselves.
+
+    Controls that are not searched, but vary by chance, have no budget.
+    """
+    if not are_searched:
+        config = config.model_copy(update={"epsilon": None})
+    asked = {
+        name: given if isinstance(given, Control) else config.python_object(CONTROL, name) or given
+        for name, given in controls_by_name(controls).items()
+    }
+    as_controls(asked)  # refuses what is none
     ready: dict[str, Control | Mapping[str, object]] = {}
     for name, given in asked.items():
-        instance = given if isinstance(given, Control) else lent(CONTROL, name)
-        for choice in _counting(type(instance), instance.settings()) if instance is not None else ():
-            if getattr(config, choice.run_setting, None) is not None:
-                raise InputError(
-                    f"{choice.run_setting}: control {instance.name} was given as an instance; set it there, as in "
-                    f"{type(instance).__name__}({choice.name}=...)"
-                )
         ready[name] = given
-        if not isinstance(given, Control):
+        if isinstance(given, Control):
+            for choice in _counting(type(given), given.settings()):
+                if getattr(config, choice.run_setting, None) is not None:
+                    raise InputError(
+                        f"{choice.run_setting}: control {given.name} was given as an instance; set it there, as in "
+                        f"{type(given).__name__}({choice.name}=...)"
+                    )
+        else:
             taken = {}
             for choice in _choices(name, given) or ():
                 value = getattr(config, choice.run_setting, None)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch import seeds
-from advsearch.config import PICTURE_SPP, PICTURES, SceneConfig
+from advsearch.config import PICTURE_SPP, PICTURES
 from advsearch.controls import compose
 from advsearch.controls.base import sentences
 from advsearch.engine.loading import Controls, Scene, Texture, as_controls, framed, load_scene, make_renderer
@@ -329,12 +329,6 @@ def things_seen(renderer: Renderer, u: Tensor) -> JsonObject | None:
             "distance": round(seen.distance, 3),
         }
     return shown
-
-
-def pictures_of(config: SceneConfig) -> dict[str, Any]:
-    """Return how `render` makes the pictures that a configuration's models are shown."""
-    sampler, size = config.pixel_sampler, config.resolution
-    return {"resolution": size, "denoise": config.denoise, "sampler": sampler, "seed": config.seed}
 
 
 def writable(path: str | Path, views: int) -> Path:

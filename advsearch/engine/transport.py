@@ -96,6 +96,11 @@ class PredictedSearch(ABC):
     def prepare(self, tick: Tick = lambda samples: None) -> None:
         """Make what predicts at the start of the search; told of samples a pixel as they are traced."""
 
+    @property
+    def too_far_off(self) -> Refusal | None:
+        """Why it cannot be used, as far as images that were traced to prepare it tell; None if it can."""
+        return None
+
     @abstractmethod
     def passed(self, query: Query) -> None:
         """Remember a query that was read back: compare, and make anew, what an evaluation would have."""

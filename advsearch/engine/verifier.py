@@ -26,7 +26,6 @@ from advsearch.attacks.trials import (
     most_samples,
 )
 from advsearch.cluster import Workers
-from advsearch.config import SceneConfig
 from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings
@@ -43,10 +42,9 @@ from advsearch.tasks import Judgement
 MANY = 64  # of a configuration with more numbers than this, a trial's row does not hold the values
 
 
-def ladder_of(config: SceneConfig) -> Sequence[int]:
-    """Return the samples a pixel that a verification climbs, as the sampler has them; one, if that was asked for."""
-    asked = getattr(config, "verify_spp", None)
-    return LADDER if asked is None else (next_count(config.pixel_sampler, asked),)
+def ladder_of(verify_spp: int | None, sampler: str) -> Sequence[int]:
+    """Return the samples per pixel that a verification climbs, as the sampler has them: one, if it is stated."""
+    return LADDER if verify_spp is None else (next_count(sampler, verify_spp),)
 
 
 @dataclass
@@ -67,9 +65,9 @@ class Verifier:
     _asked: set[tuple[str, int]] = field(default_factory=set)
 
     @classmethod
-    def open(cls, run: RunDirectory, problem: Problem, config: SceneConfig, stages: Stages) -> Verifier:
+    def open(cls, run: RunDirectory, problem: Problem, ladder: Sequence[int], stages: Stages) -> Verifier:
         """Return what makes the trials of a run in this process, and stores them."""
-        return cls(Journal(run, Shared(problem)), ladder_of(config), stages)
+        return cls(Journal(run, Shared(problem)), ladder, stages)
 
     def __post_init__(self) -> None:
         self.problem: Problem = self.journal.problem

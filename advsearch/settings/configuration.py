@@ -197,6 +197,7 @@ class Config(BaseModel):
     free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")  # they decide no number: they may change before a run goes on
 
     _only_here: tuple[PythonOnly, ...] = PrivateAttr(())
+    _python_objects: dict[tuple[str, str], Any] = PrivateAttr(default_factory=dict)
     _left_out: tuple[LeftOut, ...] = PrivateAttr(())
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
@@ -300,7 +301,7 @@ class Config(BaseModel):
     def of(cls, other: Config, **changes: object) -> Self:
         """Return what another command's configuration describes as one of this, in a place of its own: the settings
         that are `shared`, but for the changes."""
-        return cls(**{**cls.shared(other), **changes}).with_only_here(other.only_here)
+        return cls(**{**cls.shared(other), **changes}).with_python_parts_of(other)
 
     @property
     def only_here(self) -> tuple[PythonOnly, ...]:
@@ -312,6 +313,25 @@ class Config(BaseModel):
         copy = self.model_copy()
         copy._only_here = tuple(parts)
         return copy
+
+    def python_object(self, role: str, name: str) -> Any:
+        """Return the object that a Python caller passed for a name in these settings; None if there is only the name.
+
+        Args:
+            role: "scene", "model" or "control".
+            name: of the object, as the settings have it.
+        """
+        return self._python_objects.get((role, name))
+
+    def with_python_objects(self, objects: Mapping[tuple[str, str], Any]) -> Self:
+        """Return a copy that holds objects, by role and name, in place of what these settings name."""
+        copy = self.model_copy()
+        copy._python_objects = {**self._python_objects, **objects}
+        return copy
+
+    def with_python_parts_of(self, other: Config) -> Self:
+        """Return a copy with the objects of other settings, and with their parts that exist only in this session."""
+        return self.with_only_here(other.only_here).with_python_objects(other._python_objects)
 
     def to_yaml(self) -> str:
         """Return the YAML form; `from_yaml` of it gives an equal configuration, where no `powers` are in it."""

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import ast
+import collections.abc
 import inspect
-import runpy
+import typing
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 import torch
 from torch import Tensor, nn
 
 import advsearch
+from advsearch.api import keywords as api_keywords
+from advsearch.api.keywords import hint_of
 from advsearch.config import CONFIGS
 from advsearch.errors import InputError
 from advsearch.models import ModelWarning
+from advsearch.questions.attack.python import AttackKeywords
+from advsearch.questions.sweep.carry_out import SweepKeywords
 from advsearch.settings import settings
 
 
@@ -62,17 +68,39 @@ def test_signatures_have_every_setting_as_it_is_declared(name: str) -> None:
 
 def test_editors_and_type_checkers_know_every_setting() -> None:
     """Each comment would be one too many, and mypy would say so, if a keyword had no type."""
+    with pytest.raises(InputError, match=r"^steps: expected a whole number from 1 to 1000000, got many"):
+        advsearch.attack("mug", steps="many")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"^sampler: expected sobol or random, got square"):
+        advsearch.sweep("mug", sampler="square")  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"^samples: expected a whole number from 8 to 1000000, got many"):
-        advsearch.region("mug", samples="many")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"^loss: expected linear, model or both, got square"):
-        advsearch.check(loss="square")  # type: ignore[arg-type]
+        advsearch.region("mug", samples="many")
     with pytest.raises(TypeError, match=r"stability\(\) got an unexpected keyword argument 'object'"):
-        advsearch.stability(object="mug")  # type: ignore[call-arg]
+        advsearch.stability(object="mug")
 
 
-def test_what_type_checkers_read_is_made_anew() -> None:
-    made = runpy.run_path(str(Path(__file__).parents[2] / "tools" / "stubs.py"))
-    assert made["FILE"].read_text("utf-8") == made["text"](), "python tools/stubs.py"
+@pytest.mark.parametrize(
+    ("function", "keywords", "command"),
+    [(advsearch.attack, AttackKeywords, "attack"), (advsearch.sweep, SweepKeywords, "sweep")],
+)
+def test_typed_keywords_are_the_settings(function: Any, keywords: Any, command: str) -> None:
+    """All that the function has no argument of its own for, each with what Python callers may write."""
+    own = inspect.signature(function.__wrapped__).parameters
+    fields, declared = CONFIGS[command].model_fields, settings(CONFIGS[command])
+    optional = [one.field for one in declared if not one.required]
+    expected = {field.removesuffix("_"): hint_of(field, fields[field].annotation) for field in optional}
+    names = {**vars(typing), **vars(collections.abc), **vars(api_keywords)}
+    hints = get_type_hints(keywords)
+    assert hints.keys() == expected.keys() - own.keys()
+    for name, hint in hints.items():
+        assert hint == eval(expected[name], names), name
+
+
+def test_type_checkers_see_every_public_name() -> None:
+    """The block of imports, which nothing else reads, has each name that is imported on first use."""
+    tree = ast.parse(Path(advsearch.__file__).read_text("utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    imported = {alias.name for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert imported == {*advsearch.__all__}
 
 
 def test_an_argument_that_there_is_not_is_python_s_own_error() -> None:

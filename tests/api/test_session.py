@@ -23,16 +23,18 @@ from stand_ins import interrupted
 from torch import Tensor, nn
 
 import advsearch
+from advsearch.api.keywords import configured
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS
 from advsearch.controls import Control
 from advsearch.controls.base import NumberControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
+from advsearch.engine.naming import given_to, load_models, scene_of
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.models import ModelWarning
 from advsearch.progress import NullProgress
-from advsearch.questions.attack import carry_out as attacking
+from advsearch.questions.attack import python
 from advsearch.questions.attack.carry_out import problem_from_config
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.wording import objective_text
@@ -42,6 +44,7 @@ from advsearch.runs.directory import is_run
 from advsearch.runs.store import Store
 from advsearch.scene.settings import Parameter
 from advsearch.settings import settings
+from advsearch.tasks import make_task
 
 SIDE = 16
 FAST: dict[str, Any] = {
@@ -81,7 +84,7 @@ def victim(threshold: float, name: str = "bright") -> advsearch.Model:
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """What an attack would do, without doing it."""
-    monkeypatch.setattr(attacking, "carry_out", lambda job, *_: job)
+    monkeypatch.setattr(python, "run_attack", lambda parts, *_: parts)
     return advsearch.attack
 
 
@@ -283,6 +286,20 @@ class Faded(NumberControl):
 
     def scene_inputs(self, values: Any, so_far: Any) -> dict[str, Tensor]:
         return {"object.roughness": 0.5 + 0.5 * values["amount"]}
+
+
+def test_settings_hold_the_objects_that_they_name_and_nothing_else_does(scene: advsearch.Scene) -> None:
+    model, faded = victim(0.5), Faded(amount=[0.0, 0.5])
+    config = configured(RegionConfig, object=scene, model=model, controls=[faded, "pose.yaw"])
+    assert [(part.role, part.name) for part in config.only_here] == [("model", "bright"), ("control", "Faded")]
+    assert (config.object, config.model, [*config.controls]) == ("mug", "bright", ["faded", "pose.yaw"])
+    attacked = AttackConfig.of(config, seed=3)  # goes on from one experiment to another
+    assert scene_of(attacked) is scene and given_to(attacked, attacked.controls)[0] is faded
+    (loaded,), _ = load_models([attacked.model], make_task("classification"), attacked)
+    assert loaded.module is model.module
+    with pytest.raises(AdvsearchError, match="bright"):  # the name alone is not known
+        load_models(["bright"], make_task("classification"), AttackConfig(object="mug", model="bright"))
+    assert scene_of(AttackConfig(object="mug")) is not scene
 
 
 def test_instances_and_names_go_together_in_every_question(

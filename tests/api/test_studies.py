@@ -22,7 +22,7 @@ from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.experiment import RunContext, run_and_save, run_experiment
-from advsearch.questions.attack import carry_out as attacking
+from advsearch.questions.attack import studies
 from advsearch.questions.attack.display import claims
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.studies import curve
@@ -50,7 +50,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[AttackConfig]
             run.write_summary(summary)
         return SimpleNamespace(summary=summary)
 
-    monkeypatch.setattr(attacking, "attack_once", attack)
+    monkeypatch.setattr(studies, "attack_once", attack)
     return done
 
 
@@ -112,18 +112,18 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     asked: list[AttackConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = AttackConfig(object="mug,bowl,vase,pan", average=50, run="study")
-    carry_out: Callable[..., Any] = vars(attacking)["attack_once"]  # the stand-in
+    carry_out: Callable[..., Any] = vars(studies)["attack_once"]  # the stand-in
 
     def stopped(config: AttackConfig, *, progress: Any, clean: CleanMatrix | None = None) -> Any:
         if len(asked) == 2:
             raise KeyboardInterrupt
         return carry_out(config, progress=progress)
 
-    monkeypatch.setattr(attacking, "attack_once", stopped)
+    monkeypatch.setattr(studies, "attack_once", stopped)
     with pytest.raises(KeyboardInterrupt):
         run_and_save(curve, RunContext(config))
     assert Path("runs/study/parts/00-mug/summary.json").is_file()
-    monkeypatch.setattr(attacking, "attack_once", carry_out)
+    monkeypatch.setattr(studies, "attack_once", carry_out)
     summary = run_and_save(curve, RunContext(config, resumed=Path("runs/study")))
     assert [row.object for row in summary.table] == ["mug", "bowl", "vase", "pan"]
     assert len(asked) == 4, "two before the stop, two after it"

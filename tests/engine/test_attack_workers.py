@@ -13,8 +13,8 @@ from stand_ins import shared
 import advsearch
 from advsearch.cli.output import shown_text as text_of
 from advsearch.errors import InputError
-from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.store import Row, Store
 

@@ -16,8 +16,8 @@ from advsearch.engine import acceptance, bank
 from advsearch.engine.bank import Bank, stratified
 from advsearch.engine.problem import hard_first
 from advsearch.errors import ClusterError
-from advsearch.questions.attack.carry_out import attack_once
 from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.scene.predictor import Refusal
 from advsearch.scene.surface import renderer as surface_renderer

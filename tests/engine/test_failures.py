@@ -9,18 +9,20 @@ from typing import Any
 import pytest
 import torch
 from samples import attack, make_run, written_page
-from stand_ins import StandInProblem, attack_on, configuration
+from stand_ins import StandInProblem
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult, make_policy
+from advsearch.attacks import Block, Domain, Ending, Evaluation, Query, SearchResult
 from advsearch.attacks.candidates import Failures, FailureShare, FoundFailure
-from advsearch.attacks.verification import OVER_CONDITIONS, Rule
+from advsearch.attacks.verification import OVER_CONDITIONS, TRIAL_LOOKS, Rule
 from advsearch.cli.output import shown_text as text_of
+from advsearch.engine.journal import Journal, Shared
 from advsearch.engine.record import Findings
+from advsearch.engine.verifier import Verifier
 from advsearch.progress import NullProgress, Stages
 from advsearch.questions.attack.display import failures_part, failures_text
 from advsearch.questions.attack.outcome import described_failures
-from advsearch.questions.attack.stages import TRIED, Attack, check_failures
+from advsearch.questions.attack.stages import TRIED, check_failures
 from advsearch.questions.attack.summary import DifferentFailures
 
 NAMED = Domain(torch.full((3,), 0.5), (Block(1, name="u.0"), Block(1, name="u.1"), Block(1, name="kind", options=2)))
@@ -43,37 +45,33 @@ def failure(first: float, objective: float = 1.0) -> FoundFailure:
     return FoundFailure(torch.tensor([first, 0.5, 0.25]), objective, {0: (first - 0.05, first + 0.05), 2: (0.0, 0.5)})
 
 
-def checked(known: Failures, *, rule: Rule | None = None, trials: int = 20) -> Attack:
+def checked(known: Failures, *, rule: Rule | None = None, trials: int = 20) -> Verifier:
     """An attack of which everything but the different failures has been checked."""
     problem: Any = Coin(domain=NAMED)
     problem.rule = rule or problem.rule
-    attacked = attack_on(
-        problem, configuration().model_copy(update={"trials": None}), make_policy("archive"), Stages(NullProgress())
-    )
+    verifier = Verifier(Journal(None, Shared(problem)), (8,), Stages(NullProgress()), looks=TRIAL_LOOKS)
     nothing = (0.0, 0.0, 0.0, Ending.FOUND, Ending.FOUND, (), (), 1, 0, 0, 0, 0.0)
     found = SearchResult(torch.full((3,), 0.5), *nothing, failures=known)
-    attacked.findings.search = found
-    verifier = attacked._verifier
+    verifier.findings.search = found
     verifier.choose_spp({"clean": NAMED.start})
     clean = tuple(StandInProblem().evaluate(Query(torch.zeros(6), seed)).said for seed in range(trials))
-    attacked.findings.clean = clean
+    verifier.findings.clean = clean
     check_failures(verifier, found)
-    return attacked
+    return verifier
 
 
 def failures(*firsts: float) -> Failures:
     return Failures(tuple(failure(first, 4.0 - first) for first in firsts), (0, 2), 30, 50, 100)
 
 
-def described(attacked: Attack) -> DifferentFailures:
-    told = described_failures(attacked.problem, attacked.findings)
+def described(verifier: Verifier) -> DifferentFailures:
+    told = described_failures(verifier.problem, verifier.findings)
     assert told is not None
     return told
 
 
 def test_each_is_tried_until_it_is_clear_and_a_lucky_one_does_not_hold() -> None:
-    attacked = checked(failures(0.9, 0.45, 0.8, 0.2))
-    told = described(attacked)
+    told = described(checked(failures(0.9, 0.45, 0.8, 0.2)))
     assert [one.holds for one in told.listed] == [True, False, True, False]
     assert [one.verified.trials for one in told.listed if one.verified][0::2] == [14, 14]
     assert told.listed[3].verified is not None and told.listed[3].verified.trials == 2

@@ -15,7 +15,7 @@ from advsearch.cli.output import shown_text as text_of
 from advsearch.engine.judging import off_print, variation
 from advsearch.errors import InputError
 from advsearch.progress import Stages
-from advsearch.questions.attack.carry_out import attack_once
+from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.wording import method_facts, print_cost_text, renders_text
 

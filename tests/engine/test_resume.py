@@ -97,8 +97,7 @@ def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
 
     problem: Any = StandInProblem(on_evaluation=counted)
     with RunDirectory.create(tmp_path / "run", config=config) as run:
-        attack = attack_on(problem, config, make_policy("pgd"), Stages(NullProgress()), run)
-        assert attack.carry_out().interrupted
+        assert attack_on(problem, config, make_policy("pgd"), Stages(NullProgress()), run).interrupted
     assert can_resume(tmp_path / "run")
     found = carry_out(tmp_path / "run", config, resume=True)
     assert found.search is not None and len(found.search.history) == 25
@@ -270,8 +269,7 @@ class Weaker(StandInProblem):
 def test_the_random_searchs_configuration_is_taken_where_it_is_the_worse_one(policy: Policy[Any], beaten: bool) -> None:
     problem: Any = Weaker()
     config = configuration().model_copy(update={"steps": 200})
-    attack = attack_on(problem, config, policy, Stages(NullProgress()))
-    findings = attack.carry_out()
+    findings = attack_on(problem, config, policy, Stages(NullProgress()))
     assert findings.search is not None and findings.baseline is not None and findings.verification is not None
     assert (findings.beaten is not None) == beaten
     random = findings.baseline.best_u

@@ -17,7 +17,7 @@ from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
 from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, given_to, settings_alone
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.questions.attack import carry_out as attacking
+from advsearch.questions.attack import python
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep.carry_out import job_of
 from advsearch.questions.sweep.settings import SweepConfig
@@ -82,7 +82,7 @@ def test_a_patch_takes_an_epsilon_in_the_norm_of_the_run(norm: str | None, expec
     "controls", [["texture"], "texture", ("texture",), {"texture": {}}, {"texture:texture": {}}, ["texture", "pose"]]
 )
 def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attacking, "carry_out", lambda job, *_: job)
+    monkeypatch.setattr(python, "run_attack", lambda parts, *_: parts)
     job: Any = advsearch.attack("mug", controls=controls, **ALL)
     again = given_to(job.config, job.config.controls)
     texture: Any
@@ -91,7 +91,7 @@ def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatc
 
 
 def test_what_varies_by_chance_takes_all_but_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(attacking, "carry_out", lambda job, *_: job)
+    monkeypatch.setattr(python, "run_attack", lambda parts, *_: parts)
     job: Any = advsearch.attack("mug", controls=["geometry"], over=["texture:label"], **ALL)
     assert job.controls[0].settings() == {"epsilon": 0.07}
     assert job.over[0].settings() == {"kind": "texture", "norm": "l2", "resolution": 16}

@@ -39,7 +39,7 @@ def finding(trial: Callable[[str, int, Tensor], Any]) -> Any:
     searches: Any = SimpleNamespace(problem=problem, findings=findings, policy=None, begin=said, search=search)
     verifier: Any = SimpleNamespace(begin=said, trials=trials, count=20)
     with suppress(KeyboardInterrupt):
-        find_smallest(searches, verifier)
+        find_smallest(searches, searches.policy, verifier)
     return findings
 
 

@@ -18,8 +18,9 @@ from advsearch.attacks.evaluation import Query
 from advsearch.engine import acceptance, surface_light
 from advsearch.engine.acceptance import ComparedView, Deviation
 from advsearch.engine.surface_light import SurfaceLight
-from advsearch.questions.attack.carry_out import attack_once, parts_of, problem_of_parts
+from advsearch.questions.attack.carry_out import parts_of, problem_of_parts
 from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.runs.store import NAME as STORE
 from advsearch.runs.store import Store

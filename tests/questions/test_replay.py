@@ -17,7 +17,8 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.verifier import RetrialCondition, Retrials
 from advsearch.errors import FileFormatError, InputError
 from advsearch.progress import NullProgress
-from advsearch.questions.attack.carry_out import attack_once, problem_from_config
+from advsearch.questions.attack.carry_out import problem_from_config
+from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.replay import replay
 from advsearch.questions.replay.result import ReplayConfig, ReplayResult, replay_text

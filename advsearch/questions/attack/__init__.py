@@ -13,7 +13,7 @@ from advsearch.questions.attack.summary import BY_FIELD, AttackSummary, CurveRes
     "attack --object mug --control texture",
     "attack --object mug --control texture --epsilon 0.03 --set camera.azimuth=130 --seed 1",
     "attack --object mug --model reference,torchvision:resnet18 --label mug,cup",
-    python_function="advsearch.questions.attack.carry_out:attack",
+    python_function="advsearch.questions.attack.python:attack",
     view=shown,
     claims=claims,
     page=page,
@@ -22,7 +22,7 @@ from advsearch.questions.attack.summary import BY_FIELD, AttackSummary, CurveRes
 def attack(asked: RunContext[AttackConfig]) -> AttackSummary | CurveResult | MatrixResult:
     """Find the worst configuration of a scene, and verify it with fresh renders; or do so for several."""
     # imports torch
-    from advsearch.questions.attack.carry_out import attack_once
+    from advsearch.questions.attack.run import attack_once
     from advsearch.questions.attack.studies import curve, matrix
 
     if asked.config.is_study:

@@ -21,7 +21,6 @@ from advsearch.options import OUT_OF_VIEW, Value
 from advsearch.progress import Stages
 from advsearch.questions.attack import result as kept
 from advsearch.questions.attack.result import AttackResult, KeptPicture
-from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.stages import UNPRINTED
 from advsearch.questions.attack.summary import (
     AmbientLight,
@@ -67,10 +66,35 @@ T = TypeVar("T")
 MOST_NUMBERS = 4096  # Numbers of a distribution that a summary names, at most
 
 
-def summarise(
-    config: AttackConfig, objective: str | None, findings: Findings, journal: Journal, stages: Stages,
+def make_result(
+    findings: Findings,
+    journal: Journal,
+    stages: Stages,
     warnings: Sequence[str],
-) -> AttackResult:  # fmt: skip
+    *,
+    object_name: str,
+    judge: str,
+    policy: str,
+    objective: str | None,
+    printable: bool,
+    command_line: str | None,
+    python_only: list[str],
+) -> AttackResult:
+    """Make the result of an attack from what it found, and store it with its images in the run, if there is one.
+
+    Args:
+        findings: of the attack.
+        journal: of the run.
+        stages: which took their time.
+        warnings: so far.
+        object_name: of the object under attack.
+        judge: the thing that is judged.
+        policy: by name, as requested.
+        objective: by name; None for the task's own.
+        printable: whether the search had print terms.
+        command_line: repeats the attack; None where no command does.
+        python_only: its parts that exist only in Python.
+    """
     problem, search, run = journal.problem, findings.search, journal.run
     space, start = problem.searched_space, problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
@@ -98,13 +122,13 @@ def summarise(
     path = None if run is None else run.path
     summary = AttackSummary(
         run=None if path is None else str(path),
-        object=config.object,
-        judge=config.judge,
+        object=object_name,
+        judge=judge,
         model=problem.model.name,
         task=task.title,
         environment=problem.environment,
         controls=[bound.name for bound in controls],
-        policy=config.policy_name,
+        policy=policy,
         objective=name_objective(task, objective),
         epsilon=_alone({bound.name: bound.budget.epsilon for bound in controls}),
         norm=_alone({bound.name: bound.budget.norm for bound in controls}),
@@ -131,7 +155,7 @@ def summarise(
         ambient=_ambient_light(findings),
         average=_average_case(findings),
         smallest=_smallest_epsilon(problem, findings),
-        printability=_printability(problem, findings) if config.printable else None,
+        printability=_printability(problem, findings) if printable else None,
         distribution=None if search is None else _distribution(problem, search),
         failures=described_failures(problem, findings),
         sample_count=findings.sample_count and VerificationSamples.of(findings.sample_count),
@@ -149,8 +173,8 @@ def summarise(
         warnings=[*warnings, *_remarks(findings, problem, journal)],
         seconds={**stages.seconds, "total": stages.total},
         seed=problem.seed,
-        command_line=config.command_line(path),
-        python_only=config.python_only,
+        command_line=command_line,
+        python_only=python_only,
     )
     if run is not None:
         keep_result(run, summary)

@@ -24,7 +24,7 @@ from advsearch.engine.loading import Scene, load_scene
 from advsearch.engine.naming import AnyModel, in_turn
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings
-from advsearch.engine.rendering import Rendering, pictures_of, render
+from advsearch.engine.rendering import Rendering, render
 from advsearch.errors import InputError
 from advsearch.questions.attack.summary import AlongDrive, AttackSummary
 from advsearch.report.figures import marked, new_axes, search_axes
@@ -168,7 +168,7 @@ class AttackResult:
         task = parts.task if model is not None else task_for(parts.task, parts.loaded[0])
         return render(
             seen, parts.loaded[0] if model is None else model, task=task, label=parts.config.label,
-            controls=parts.controls, at=self.u, **{**pictures_of(parts.config), **options},
+            controls=parts.controls, at=self.u, **{**parts.config.image_settings, **options},
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,13 +1,12 @@
-"""The stages of an attack, one after the other: first look, search, random search beside it, verification. For the
-smallest change that flips the prediction, searches and trials take turns, within ever smaller budgets."""
+"""The stages of an attack, in the order in which `advsearch.questions.attack.run` goes through them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from torch import Tensor
 
@@ -21,14 +20,12 @@ from advsearch.attacks import (
     StepRecord,
     Verification,
     count_right,
-    make_policy,
     planned_renders,
     run_trials,
     search,
 )
-from advsearch.attacks.candidates import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, scaled, smallest
+from advsearch.attacks.candidates import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, smallest
 from advsearch.attacks.evaluation import Query
-from advsearch.attacks.verification import OVER_LOOKS, TRIAL_LOOKS
 from advsearch.engine import surface_light
 from advsearch.engine.bank import Bank
 from advsearch.engine.gradients import planning
@@ -39,305 +36,388 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings
 from advsearch.engine.surface_light import SurfaceLight
 from advsearch.engine.transport import CleanMatrix, PredictedSearch, Transport, refusal_of_matrices, remark
-from advsearch.engine.verifier import Verifier, ladder_of
-from advsearch.interrupts import interruptible
+from advsearch.engine.verifier import Verifier
 from advsearch.progress import Stages
 from advsearch.questions.attack.ambient import find_ambient
-from advsearch.questions.attack.settings import AttackConfig
 from advsearch.report.wording import count
 from advsearch.scene.predictor import Refusal, RefusalCause
 from advsearch.scene.transport.matrix import TransportTooLargeError
+from advsearch.tasks import Judgement
 
-MOST_FRAMES = 60
+MAX_FRAMES = 60
 UNPRINTED = "search without print terms"
-"""The kind of the search beside one with print terms: what these cost is told by its result."""
-"""The note of what the model and the objective said of the first look, and of what it consists for each picture."""
+"""The kind of the search without print terms, alongside one with them: it tells what these cost."""
 FIRST_LOOK = 4
 """Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
 
+Measure = Literal["no", "quick", "full"]
+"""Which gradient estimators are measured before a search: none, the contested ones, or all, with step and samples."""
 
-@dataclass
-class Attack:
-    """One search on one problem with its verification; what is known so far is in `findings`. Attacks with other
-    budgets share the matrix `clean`."""
 
-    journal: Journal
-    config: AttackConfig
-    policy: Policy[Any]
-    stages: Stages
-    findings: Findings = field(default_factory=Findings)
-    clean: CleanMatrix = field(default_factory=CleanMatrix)
+# ---- before the search ----------------------------------------------------------------------------------------------
 
-    def __post_init__(self) -> None:
-        self.problem: Problem = self.journal.problem
-        self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
-        looks = TRIAL_LOOKS if self.problem.conditions is None else OVER_LOOKS
-        if self.config.trials is not None or self.config.smallest:
-            looks = (self.config.trial_count,)
-        self._verifier = Verifier(self.journal, ladder_of(self.config), self.stages, self.findings, looks)
 
-    def carry_out(self) -> Findings:
-        if self.config.smallest:
-            scaled(self.problem.domain, 1.0)  # refuses what has no budget before anything is rendered
-        try:
-            with interruptible():
-                self.plan()
-                if self.worth_attacking():
-                    self.collect_transport()
-                    if self.config.smallest:
-                        find_smallest(self, self._verifier)
-                    else:
-                        self.search_all()
-                    self.verify()
-                if self.config.average:
-                    self._verifier.average(self.config.average)
-        except KeyboardInterrupt:
-            self.findings.interrupted = True
-        self.stages.end()
-        return self.findings
+def plan_renders(
+    policy: Policy[Any],
+    journal: Journal,
+    stages: Stages,
+    *,
+    specialise: bool,
+    measure: Measure,
+    deterministic: bool,
+    chooses_spp: bool,
+) -> None:
+    """Choose the bounces of light, gradient estimators and samples of a search by measurement on the scene.
 
-    def plan(self) -> None:
-        problem, config, stored = self.problem, self.config, self.journal.note(PLAN)
-        if stored is not None:
-            problem.plan = problem.plan.restored(stored["plan"])
-            problem.spp, problem.search_depth = stored["spp"], stored["search_depth"]
-            return
-        worth = config.specialise and (config.measure == "full" or problem.steps >= planning.WORTH_BOUNCES)
-        against = surface_light.refusal_of_surface_light(problem, problem.steps, self.policy, config.specialise)
-        if worth and against is not None:  # else no step will be rendered
+    The choice is set in the journal's problem, and stored: a run that goes on has the same.
+
+    Args:
+        policy: what searches; only one that uses gradients has them measured.
+        journal: of the run.
+        stages: is told what is measured.
+        specialise: whether what the search does not need may be left out.
+        measure: which gradient estimators are measured.
+        deterministic: whether counts decide in place of times.
+        chooses_spp: whether a full measurement may choose the samples per pixel.
+    """
+    problem = journal.problem
+    stored = journal.note(PLAN)
+    if stored is not None:
+        problem.plan = problem.plan.restored(stored["plan"])
+        problem.spp = stored["spp"]
+        problem.search_depth = stored["search_depth"]
+        return
+    is_worth_measuring = measure == "full" or problem.steps >= planning.WORTH_BOUNCES
+    if specialise and is_worth_measuring:
+        refusal = surface_light.refusal_of_surface_light(problem, problem.steps, policy, specialise)
+        if refusal is not None:  # else no step will be rendered
             title, most = "finding how many bounces of light the search needs", planning.most_pictures(problem)
             hint = "few samples each; `specialise=false` leaves it out"
-            self.stages.begin("setup", title, most, hint=hint, at_most=True)
-            tick = self.stages.progress.advance
+            stages.begin("setup", title, most, hint=hint, at_most=True)
+            tick = stages.progress.advance
             problem.search_depth = planning.bounces_of(problem, problem.seed, tick=tick).depth
-        self._measure()
-        chosen = {"plan": problem.plan.to_dict(), "spp": problem.spp, "search_depth": problem.search_depth}
-        self.journal.set_note(PLAN, chosen)
+    is_full = measure == "full"
+    if policy.uses_gradient and measure != "no":
+        # else derivatives come from what predicts the images
+        if is_full or refusal_of_matrices(problem, problem.steps, specialise) is not None:
+            _measure_gradients(problem, stages, full=is_full, deterministic=deterministic, chooses_spp=chooses_spp)
+    chosen = {"plan": problem.plan.to_dict(), "spp": problem.spp, "search_depth": problem.search_depth}
+    journal.set_note(PLAN, chosen)
 
-    def _measure(self) -> None:
-        problem, config, progress = self.problem, self.config, self.stages.progress
-        full = config.measure == "full"
-        if config.measure == "no" or not self.policy.uses_gradient:
-            return
-        if not full and refusal_of_matrices(problem, problem.steps, config.specialise) is None:
-            return  # derivatives will come from what predicts the pictures
-        renderer, counted = problem.renderer, not full or config.deterministic
-        seed = seeds.stream(problem.seed, "measure")
-        u, tick = interior_point(renderer), lambda samples: progress.advance(1)
-        bench = Bench(renderer, problem.loss, u, seed, problem.spp, tick=tick)
-        gradients = planning.plan_gradients(renderer.plan, every=full)
-        if gradients:
-            hint = f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; `measure=no` leaves it out"
-            self.stages.begin("setup", "measuring which gradients are best here", gradients, hint=hint)
-        problem.plan = planning.measured_plan(bench, every=full, counted=counted)
-        if full:
-            samples = planning.cosine_samples(problem.plan)
-            hint = "counted in samples a pixel; `measure=quick` leaves it out"
-            self.stages.begin("setup", "choosing step and samples of gradients", samples, hint=hint, at_most=True)
-            table = list(planning.cosines(replace(bench, tick=progress.advance)))
-            problem.plan, spp = planning.tuned(problem.plan, table)
-            problem.spp = spp if config.spp is None and spp is not None else problem.spp
 
-    def worth_attacking(self) -> bool:
-        """Look at the clean configuration; one that is wrong in every look goes through the full trials at once, as
-        does one whose smallest change is wanted."""
-        problem, config, findings = self.problem, self.config, self.findings
-        spp, seed, start = self._asked_spp, seeds.stream(problem.seed, "first look"), problem.domain.start
-        hint = "the first picture compiles the renderer's code"
-        self.stages.begin("setup", "looking at the clean scene", FIRST_LOOK, hint=hint)
+def _measure_gradients(problem: Problem, stages: Stages, *, full: bool, deterministic: bool, chooses_spp: bool) -> None:
+    """Choose gradient estimators, and with `full` their step and samples, by measurement."""
+    renderer, progress = problem.renderer, stages.progress
+    counted = not full or deterministic
+    seed = seeds.stream(problem.seed, "measure")
+    bench = Bench(
+        renderer, problem.loss, interior_point(renderer), seed, problem.spp, tick=lambda samples: progress.advance(1)
+    )
+    gradients = planning.plan_gradients(renderer.plan, every=full)
+    if gradients:
+        hint = f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; `measure=no` leaves it out"
+        stages.begin("setup", "measuring which gradients are best here", gradients, hint=hint)
+    problem.plan = planning.measured_plan(bench, every=full, counted=counted)
+    if full:
+        samples = planning.cosine_samples(problem.plan)
+        hint = "counted in samples a pixel; `measure=quick` leaves it out"
+        stages.begin("setup", "choosing step and samples of gradients", samples, hint=hint, at_most=True)
+        table = list(planning.cosines(replace(bench, tick=progress.advance)))
+        problem.plan, spp = planning.tuned(problem.plan, table)
+        if chooses_spp and spp is not None:
+            problem.spp = spp
 
-        def look(query: Query) -> Evaluation:
-            evaluation = problem.evaluate(query)
-            self.stages.progress.advance(1)
-            return evaluation
 
-        findings.first_look = run_trials(partial(map, look), start, spp=spp, seed=seed, trials=FIRST_LOOK)
-        looks_right = any(trial.right for trial in findings.first_look)
-        if not problem.rule.control or (looks_right and not config.smallest):
-            return True
-        self._verifier.choose_spp({"clean": start})
-        self._verifier.begin("checking the clean scene with fresh renders", self._verifier.looks[0])
-        self._verifier.try_clean()
-        return not problem.rule.already_wrong(count_right(findings.clean, findings.spp))
+def look_at_clean_scene(journal: Journal, stages: Stages, spp: int) -> tuple[Judgement, ...]:
+    """Render the clean configuration a few times, and return what model and objective say."""
+    problem = journal.problem
+    seed, start = seeds.stream(problem.seed, "first look"), problem.domain.start
+    hint = "the first picture compiles the renderer's code"
+    stages.begin("setup", "looking at the clean scene", FIRST_LOOK, hint=hint)
 
-    def verify(self) -> None:
-        """Choose the sample count, then try the clean configuration, the adversarial configuration, that without print
-        terms and the baseline's with equal seeds.
+    def evaluate(query: Query) -> Evaluation:
+        evaluation = problem.evaluate(query)
+        stages.progress.advance(1)
+        return evaluation
 
-        The smallest change lies at the decision, where no sample count settles the margin: it is tried with that of the
-        clean configuration, as on the way to it.
-        """
-        findings, problem, verifier = self.findings, self.problem, self._verifier
-        answered, baseline, unprinted = findings.search, findings.baseline, findings.unprinted
-        if answered is None:
-            raise RuntimeError("nothing was searched, so there is nothing to verify")
-        adversarial = problem.domain.project(answered.best_u)
-        searched = [result for result in (answered, baseline, unprinted) if result is not None]
-        if not self.config.smallest or findings.sample_count is None:
-            pictures = sum((result.renders + result.gradients) * problem.draws for result in searched)
-            candidates = {"adversarial": adversarial, "clean": problem.domain.start}
-            verifier.choose_spp(candidates, searched=pictures * problem.spp)
-        groups = len(searched) + (not verifier.clean_tried)
-        verifier.begin("checking what was found with fresh renders", groups * verifier.count, at_most=True)
-        verifier.try_clean()
-        findings.verification = verifier.verified("verification", answered)
-        if findings.verification.ending is Ending.ALREADY_WRONG:
-            findings.smallest = None  # seen with other samples than before: no change at all flips the prediction
-        if unprinted is not None:
-            findings.unprinted_verification = verifier.verified("unprinted verification", unprinted)
-        if baseline is not None:
-            decided = findings.verification.ending is Ending.FOUND
-            findings.baseline_verification = verifier.verified("baseline verification", baseline, curtailed=decided)
-            self._take_the_worse(answered, baseline)
-        if not self.config.smallest:
-            check_failures(verifier, answered)
-        if findings.verification.ending is Ending.FOUND:
-            find_ambient(verifier, findings.verification.u)
+    return run_trials(partial(map, evaluate), start, spp=spp, seed=seed, trials=FIRST_LOOK)
 
-    def _take_the_worse(self, result: SearchResult, baseline: SearchResult) -> None:
-        """Let what the random search found be the run's if it is found and the worse one for the model, and remember
-        that. It is chosen by its trials, so these are no evidence: it has to be the worse one in fresh ones, too."""
-        findings = self.findings
-        by_policy, by_chance = findings.verification, findings.baseline_verification
-        if by_policy is None or by_chance is None or by_chance.ending is not Ending.FOUND:
-            return
-        if _rank(by_chance) <= _rank(by_policy):
-            return
-        title = "checking what the random search found again"
-        self._verifier.begin(title, 2 * self._verifier.count, at_most=True)
-        by_chance = self._verifier.verified("baseline verification", baseline, again=True)
-        findings.baseline_verification = by_chance
-        if _rank(by_chance) > _rank(by_policy):
-            findings.beaten, findings.verification = by_policy, by_chance
-            names = ("best_u", "best_objective", "claimed_objective", "success_rate")
-            taken = {name: getattr(baseline, name) for name in names}
-            findings.search = replace(result, **taken, distribution=None)
 
-    def collect_transport(self) -> None:
-        problem, steps, findings = self.problem, self.problem.steps, self.findings
-        specialise = self.config.specialise
-        matrix = refusal_of_matrices(problem, steps, specialise)
-        surface = surface_light.refusal_of_surface_light(problem, steps, self.policy, specialise)
-        if matrix is None and problem.conditions is None:
-            self._prepare(Transport(problem, steps, clean=self.clean), "collecting light transport")
-            return
+def is_already_wrong(verifier: Verifier, *, in_any_case: bool) -> bool:
+    """Return whether the clean scene is wrong in the full trials, so that there is nothing to search for.
+
+    They are made where it was wrong in every first look, or `in_any_case`.
+    """
+    problem, findings = verifier.problem, verifier.findings
+    looks_right = any(trial.right for trial in findings.first_look)
+    if not problem.rule.control or (looks_right and not in_any_case):
+        return False
+    verifier.choose_spp({"clean": problem.domain.start})
+    verifier.begin("checking the clean scene with fresh renders", verifier.looks[0])
+    verifier.try_clean()
+    return problem.rule.already_wrong(count_right(findings.clean, findings.spp))
+
+
+def choose_predictor(
+    policy: Policy[Any],
+    journal: Journal,
+    stages: Stages,
+    findings: Findings,
+    *,
+    specialise: bool,
+    clean: CleanMatrix,
+) -> PredictedSearch | None:
+    """Return the cheapest predictor that is accurate here, prepared, or None: then every step is rendered.
+
+    Light on surfaces is compared with traced images first. Why another predictor, or none, was taken is in `findings`.
+    """
+    problem = journal.problem
+    steps = problem.steps
+    matrix = refusal_of_matrices(problem, steps, specialise)
+    surface = surface_light.refusal_of_surface_light(problem, steps, policy, specialise)
+
+    candidates: list[Callable[[], PredictedSearch]] = []  # cheapest first
+    if matrix is None and problem.conditions is None:
+        candidates.append(lambda: Transport(problem, steps, clean=clean))
+    else:
         if surface is None:
-            light = SurfaceLight(problem, steps)
-            self._prepare(light, "finding the light on surfaces")
-            surface = light.too_far_off
-            if surface is None:
-                return
-            findings.transport, findings.surface_refused = None, surface
-            others = "rendered" if matrix else "predicted by matrices"
-            self.stages.progress.message(f"Pictures are {others}: {surface}.")
+            candidates.append(lambda: SurfaceLight(problem, steps))
         if matrix is None:
-            self._prepare(Bank(problem, steps, self.journal.traced), "collecting light transport")
-            return
-        too_short = not findings.surface_refused and refusal_of_matrices(problem, None, specialise) is None
-        is_about_matrices = too_short or surface.cause is RefusalCause.NO_CAMERA
-        self._renders_because(matrix if is_about_matrices else surface)
+            candidates.append(lambda: Bank(problem, steps, journal.traced))
 
-    def _prepare(self, predictor: PredictedSearch, title: str) -> None:
-        hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
-        self.stages.begin("transport", title, predictor.samples, hint=hint)
-        self.findings.transport = predictor
-        try:
-            predictor.prepare(self.stages.progress.advance)
-        except TransportTooLargeError as error:
-            self.findings.transport = None
-            self._renders_because(Refusal(str(error), RefusalCause.TOO_LARGE))
+    for make_predictor in candidates:
+        predictor = make_predictor()
+        refusal = _prepare(predictor, stages)
+        if refusal is None:
+            return predictor
+        if refusal.cause is RefusalCause.TOO_LARGE:
+            _report_rendering(refusal, stages, findings)
+            return None
+        surface = findings.surface_refused = refusal
+        instead = "rendered" if matrix else "predicted by matrices"
+        stages.progress.message(f"Pictures are {instead}: {refusal}.")
 
-    def _renders_because(self, refusal: Refusal) -> None:
-        self.findings.rendered_because = refusal
-        if text := remark(refusal):
-            self.stages.progress.message(text)
+    assert matrix is not None and surface is not None
+    is_too_short = not findings.surface_refused and refusal_of_matrices(problem, None, specialise) is None
+    is_about_matrices = is_too_short or surface.cause is RefusalCause.NO_CAMERA
+    _report_rendering(matrix if is_about_matrices else surface, stages, findings)
+    return None
 
-    def search_all(self) -> None:
-        config, findings, steps = self.config, self.findings, self.problem.steps
-        self.begin("search", f"searching with {self.policy.name}", steps, "`steps` or `seconds` shorten it")
-        seed, frames = self.problem.seed, findings.frames
-        findings.search = self.search("search", self.policy, steps, seed, frames, config.seconds)
-        if config.seconds is not None:  # renders of the search itself, without those of the ranking
-            steps = max(1, findings.search.history[-1].renders) if findings.search.history else 1
-        if config.printable:
-            title = "searching without print terms, to see what they cost"
-            self.begin("without print terms", title, steps, "`printable=false` leaves both out")
-            findings.unprinted = self.search(UNPRINTED, self.policy, steps, seed)
-        if not config.baseline or self.policy.name == "random":
-            return
-        self.begin("baseline", "searching at random, to compare", steps, "`baseline=false` leaves it out")
-        findings.baseline = self.search("baseline", make_policy("random"), steps, seeds.stream(seed, "baseline"))
 
-    def search(
-        self, kind: str, policy: Policy[Any], steps: int, seed: int, frames: list[Any] | None = None,
-        seconds: float | None = None, domain: Domain | None = None, ranked: bool = True,
-    ) -> SearchResult:  # fmt: skip
-        """Search, reading back what is stored already; `ranked` renders the best configurations again. Raises
-        KeyboardInterrupt where it was interrupted; the result of an interrupted main search is kept before."""
-        before, every = 0, max(1, -(-steps // MOST_FRAMES))
+def _prepare(predictor: PredictedSearch, stages: Stages) -> Refusal | None:
+    """Prepare what predicts images, and return why it cannot be used; None if it can."""
+    is_light = isinstance(predictor, SurfaceLight)
+    title = "finding the light on surfaces" if is_light else "collecting light transport"
+    hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
+    stages.begin("transport", title, predictor.samples, hint=hint)
+    try:
+        predictor.prepare(stages.progress.advance)
+    except TransportTooLargeError as error:
+        return Refusal(str(error), RefusalCause.TOO_LARGE)
+    return predictor.too_far_off
 
-        def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
-            nonlocal before
-            if evaluation.picture is not None and frames is not None:
-                frames.append(evaluation.picture.numpy())
-            self.stages.progress.advance(record.renders - before, best=record.best, **self.journal.traced.told)
-            before = record.renders
 
-        def evaluations(queries: Sequence[Query]) -> Iterator[Evaluation]:
-            if frames is not None:
-                queries = [
-                    replace(query, keep=query.phase == "search" and query.number % every == 0) for query in queries
-                ]
-            passed = (lambda query: None) if transport is None else transport.passed
-            return self.journal.evaluate_all(queries, self._evaluated, passed)
+def _report_rendering(refusal: Refusal, stages: Stages, findings: Findings) -> None:
+    findings.rendered_because = refusal
+    if text := remark(refusal):
+        stages.progress.message(text)
 
-        transport = self.findings.transport
-        exact, drawn = (transport.exact, transport.drawn) if transport is not None else (False, False)
-        result = search(
-            evaluations, replace(domain or self.problem.domain, exact=exact, drawn=drawn and policy.uses_gradient),
-            policy, steps=steps, seed=seed, candidates=4 if ranked else 0, close=self.config.close_looks,
-            late=self.journal.clock(kind, seconds), on_step=on_step, kind=kind, noise=self.problem.seed,
-        )  # fmt: skip
-        if result.ending is Ending.INTERRUPTED:
-            self.findings.search = self.findings.search or result
-            raise KeyboardInterrupt
-        return result
 
-    def _evaluated(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
-        transport, traced = self.findings.transport, self.journal.traced
-        predicts = transport if queries and queries[0].phase == "search" else None
-        evaluations = traced(queries) if predicts is None else predicts.evaluate_all(queries, traced)
-        for query, evaluation in zip(queries, evaluations, strict=True):
-            printed = self.config.printable and query.kind != UNPRINTED
-            yield penalised(evaluation, self.problem.searched_space, query.u) if printed else evaluation
+# ---- searches -------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Searches:
+    """Makes the searches of one attack: by what predicts images, where there is something, or else by rendering.
+
+    Attributes:
+        journal: replays stored evaluations, and stores the others.
+        stages: is told how far a search is.
+        findings: what is known so far; its `transport` predicts.
+        printable: whether objectives include print terms.
+        close_looks: further renders of candidates that are close to the best.
+    """
+
+    journal: Journal
+    stages: Stages
+    findings: Findings
+    printable: bool = False
+    close_looks: int = 0
+
+    @property
+    def problem(self) -> Problem:
+        return self.journal.problem
 
     def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
-        renders = planned_renders(steps, close=self.config.close_looks)
+        """Begin the stage of a search of so many steps; `shorter` says which settings shorten it."""
+        renders = planned_renders(steps, close=self.close_looks)
         hint = f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; {shorter}"
         if self.findings.transport is not None:
             hint = f"{steps} pictures predicted and {renders - steps} traced; {shorter}"
         self.stages.begin(name, title, renders, hint=hint, at_most=True)
 
+    def search(
+        self,
+        kind: str,
+        policy: Policy[Any],
+        steps: int,
+        seed: int,
+        *,
+        frames: list[Any] | None = None,
+        seconds: float | None = None,
+        domain: Domain | None = None,
+        ranked: bool = True,
+    ) -> SearchResult:
+        """Search with one policy, reading back what is stored already.
+
+        Args:
+            kind: of its rows.
+            policy: proposes configurations.
+            steps: evaluations.
+            seed: of the policy.
+            frames: are given images on the way, (H, W, 3) 8-bit values in [0, 1].
+            seconds: that it may take; None for no limit.
+            domain: to search; None for the problem's.
+            ranked: whether the best configurations are rendered again.
+
+        Raises:
+            KeyboardInterrupt: it was interrupted; the result of an interrupted main search is in `findings` before.
+        """
+        renders_before = 0
+        frame_interval = max(1, -(-steps // MAX_FRAMES))
+        transport = self.findings.transport
+
+        def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+            nonlocal renders_before
+            if evaluation.picture is not None and frames is not None:
+                frames.append(evaluation.picture.numpy())
+            new_renders = record.renders - renders_before
+            self.stages.progress.advance(new_renders, best=record.best, **self.journal.traced.told)
+            renders_before = record.renders
+
+        def evaluate(queries: Sequence[Query]) -> Iterator[Evaluation]:
+            if frames is not None:
+                queries = [
+                    replace(query, keep=query.phase == "search" and query.number % frame_interval == 0)
+                    for query in queries
+                ]
+            on_replay = (lambda query: None) if transport is None else transport.passed
+            return self.journal.evaluate_all(queries, self._evaluate, on_replay)
+
+        domain = domain or self.problem.domain
+        if transport is None:
+            domain = replace(domain, exact=False, drawn=False)
+        else:
+            domain = replace(domain, exact=transport.exact, drawn=transport.drawn and policy.uses_gradient)
+        result = search(
+            evaluate,
+            domain,
+            policy,
+            steps=steps,
+            seed=seed,
+            candidates=4 if ranked else 0,
+            close=self.close_looks,
+            late=self.journal.clock(kind, seconds),
+            on_step=on_step,
+            kind=kind,
+            noise=self.problem.seed,
+        )
+        if result.ending is Ending.INTERRUPTED:
+            self.findings.search = self.findings.search or result
+            raise KeyboardInterrupt
+        return result
+
+    def _evaluate(self, queries: Sequence[Query]) -> Iterator[Evaluation]:
+        """Answer queries by what predicts images, or by rendering, and take print terms off the objective."""
+        traced, predictor = self.journal.traced, self.findings.transport
+        if predictor is None or not queries or queries[0].phase != "search":
+            evaluations = traced(queries)
+        else:
+            evaluations = predictor.evaluate_all(queries, traced)
+        for query, evaluation in zip(queries, evaluations, strict=True):
+            has_print_terms = self.printable and query.kind != UNPRINTED
+            yield penalised(evaluation, self.problem.searched_space, query.u) if has_print_terms else evaluation
+
+
+# ---- verification ---------------------------------------------------------------------------------------------------
+
+
+def verify_searches(verifier: Verifier, *, is_smallest: bool) -> None:
+    """Verify with fresh seeds what the searches claim, paired with the clean scene.
+
+    The sample count is chosen first. Then the clean configuration, the adversarial one, that without print terms and
+    the random search's are tried with equal seeds. The smallest change lies at the decision, where no sample count
+    settles the margin: it is tried with that of the clean configuration, as on the way to it.
+    """
+    findings, problem = verifier.findings, verifier.problem
+    candidate, baseline, unprinted = findings.search, findings.baseline, findings.unprinted
+    if candidate is None:
+        raise RuntimeError("nothing was searched, so there is nothing to verify")
+    adversarial = problem.domain.project(candidate.best_u)
+    results = [result for result in (candidate, baseline, unprinted) if result is not None]
+    if not is_smallest or findings.sample_count is None:
+        n_images = sum((result.renders + result.gradients) * problem.draws for result in results)
+        configurations = {"adversarial": adversarial, "clean": problem.domain.start}
+        verifier.choose_spp(configurations, searched=n_images * problem.spp)
+    n_groups = len(results) + (not verifier.clean_tried)
+    verifier.begin("checking what was found with fresh renders", n_groups * verifier.count, at_most=True)
+    verifier.try_clean()
+    findings.verification = verifier.verified("verification", candidate)
+    if findings.verification.ending is Ending.ALREADY_WRONG:
+        findings.smallest = None  # seen with other samples than before: no change at all flips the prediction
+    if unprinted is not None:
+        findings.unprinted_verification = verifier.verified("unprinted verification", unprinted)
+    if baseline is not None:
+        is_found = findings.verification.ending is Ending.FOUND
+        findings.baseline_verification = verifier.verified("baseline verification", baseline, curtailed=is_found)
+        _take_the_worse(verifier, candidate, baseline)
+    if not is_smallest:
+        check_failures(verifier, candidate)
+    if findings.verification.ending is Ending.FOUND:
+        find_ambient(verifier, findings.verification.u)
+
+
+def _take_the_worse(verifier: Verifier, result: SearchResult, baseline: SearchResult) -> None:
+    """Let what the random search found be the run's if it is found and the worse one for the model.
+
+    It is chosen by its trials, so these are no evidence: it has to be the worse one in fresh ones, too.
+    """
+    findings = verifier.findings
+    by_policy, by_chance = findings.verification, findings.baseline_verification
+    if by_policy is None or by_chance is None or by_chance.ending is not Ending.FOUND:
+        return
+    if _rank(by_chance) <= _rank(by_policy):
+        return
+    title = "checking what the random search found again"
+    verifier.begin(title, 2 * verifier.count, at_most=True)
+    by_chance = verifier.verified("baseline verification", baseline, again=True)
+    findings.baseline_verification = by_chance
+    if _rank(by_chance) > _rank(by_policy):
+        findings.beaten, findings.verification = by_policy, by_chance
+        names = ("best_u", "best_objective", "claimed_objective", "success_rate")
+        taken = {name: getattr(baseline, name) for name in names}
+        findings.search = replace(result, **taken, distribution=None)
+
 
 CONFIRMED = 40  # Trials in a row that the upper end of a smallest epsilon has to pass, or as many checks as have them
 
 
-def find_smallest(attack: Attack, verifier: Verifier) -> None:
+def find_smallest(searches: Searches, policy: Policy[Any], verifier: Verifier) -> None:
     """Bracket the smallest epsilon; every claim on the way goes through trials with seeds of its own.
 
     On the way the fewest trials that can verify anything are enough where none fails. The upper end is tried again in
     full, and what is verified at the end is the configuration there.
     """
-    problem, findings, trials = attack.problem, attack.findings, verifier.count
+    problem, findings, trials = searches.problem, searches.findings, verifier.count
     results: list[SearchResult] = []
     transport = findings.transport if isinstance(findings.transport, Transport) else None
 
     def searched(inside: Domain, number: int) -> Tensor:
         title = f"search {number + 1} of at most {ROUNDS}"
-        attack.begin("search", title, problem.steps, "`steps` shortens each search")
+        searches.begin("search", title, problem.steps, "`steps` shortens each search")
         kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
         ranked = transport is None  # what is predicted has no noise
-        results.append(attack.search(kind, attack.policy, problem.steps, seed, domain=inside, ranked=ranked))
+        results.append(searches.search(kind, policy, problem.steps, seed, domain=inside, ranked=ranked))
         findings.search = findings.search or results[0]  # what was found if this is interrupted
         verifier.begin("trying smaller changes", MOST_CHECKS * trials, at_most=True)
         return results[-1].best_u

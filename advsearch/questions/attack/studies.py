@@ -33,6 +33,7 @@ from advsearch.files import JsonObject
 from advsearch.progress import Progress
 from advsearch.questions.attack import carry_out as attacking
 from advsearch.questions.attack import summary as results
+from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.attack.summary import AttackSummary, CurveResult, MatrixResult
 from advsearch.runs.directory import PARTS, default_name, is_run
@@ -93,7 +94,7 @@ def attacks_of(settings: JsonObject) -> Call:
             for part in chains[numbers[0]]:
                 path = Path(folder) / part.name
                 config_there = part.config.model_copy(update={"run": str(path), "overwrite": True})
-                ending = attacking.attack_once(config_there, clean=clean).summary.ending
+                ending = attack_once(config_there, clean=clean).summary.ending
                 kept = (file for file in path.rglob("*") if file.is_file() and file.name != LOCK)
                 read = {file.relative_to(path).as_posix(): file.read_bytes() for file in kept}
                 carried_out.append((part.name, str(path), read))
@@ -170,7 +171,7 @@ class StudyRun:
         self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
 
         def ask(there: AttackConfig, **more: Any) -> AttackSummary:
-            return attacking.attack_once(there, clean=clean, **more).summary
+            return attack_once(there, clean=clean, **more).summary
 
         summary = run_part(path, config, self.progress, ask)
         if not isinstance(summary, AttackSummary):

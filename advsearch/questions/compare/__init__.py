@@ -120,7 +120,7 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
     sides: list[Side] = []
     n_renders = 0
     if config.object:
-        result = context.run_part("sweep", config.sweep().with_only_here(config.only_here))
+        result = context.run_part("sweep", config.sweep().with_python_parts_of(config))
         n_renders = sum(getattr(result, "renders", {}).values())
         if not result.goes_on:
             sides = read_sides([RunDirectory.locate_part(context.run.path, "sweep")])

@@ -68,7 +68,8 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
     for text in warnings:
         stages.progress.message(text)
     varied = find_varied(problem, config)
-    verifier = workbench.Verifier.open(context.run, problem, config, stages)
+    ladder = workbench.ladder_of(config.verify_spp, config.pixel_sampler)
+    verifier = workbench.Verifier.open(context.run, problem, ladder, stages)
     grown = GrownRegion()
     with context.until_interrupted():
         grown = RegionSearch(context, verifier, varied).run()

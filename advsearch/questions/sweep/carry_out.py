@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from advsearch.api.keywords import asks
+from advsearch.api.keywords import SceneKeywords, asks
 from advsearch.cluster import Call
 from advsearch.controls import Control
 from advsearch.controls.camera import CameraControl, measured_in
@@ -44,12 +44,29 @@ from advsearch.settings import PythonOnly, split_names
 from advsearch.tasks import AnyTask, OwnTask, Task, function_of, make_task
 from advsearch.tasks.together import each_thing
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 OUTER = ("object", "environment")
 OF_A_SCENE = ("object", "environment", "up", "facing", "size", "unit", "camera", "things", "set_", "exposure")
 """Settings that a scene of the caller's own has."""
 WORKER = "advsearch.questions.sweep.carry_out:sweep_worker"  # what a worker does
 CLEAN = "clean"  # what the scene without the adversarial configuration of a run is called beside that with it
 AnyScene = Scene | str | Path
+
+
+class SweepKeywords(SceneKeywords, total=False):
+    """Settings that `sweep` takes as keywords, besides its own arguments."""
+
+    spp: int | None
+    sampler: Literal["sobol", "random"]
+    batch: int
+    fps: float
+    keep_pictures: Literal["all", "wrong", "none"]
+    must_change: str | Path | None
+    must_not_change: str | Path | None
+    surface: bool
+    trials: int
 
 
 @asks(SweepConfig)
@@ -66,7 +83,7 @@ def sweep(
     tracker: Callable[[], Step] | None = None,
     run: str | Path | None = None,
     progress: Watched = None,
-    **settings: Any,
+    **settings: Unpack[SweepKeywords],
 ) -> SweepResult:
     """Render every configuration of a grid, and draws by chance, and say how often the model is right.
 
@@ -92,7 +109,7 @@ def sweep(
             `advsearch.questions.sweep.tracks.ConstantVelocity`.
         run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
     """
-    options = {name: value for name, value in settings.items() if value is not None}
+    options: dict[str, Any] = {name: value for name, value in settings.items() if value is not None}
     if not isinstance(grid, (Mapping, type(None))):
         raise InputError(f"grid: expected a mapping from parameters to values, got {type(grid).__name__}")
     if isinstance(adversarial_of, AttackResult):
@@ -263,7 +280,10 @@ def _job(
     networks, warnings = load_models(models, made, config)
     _check_different([model.name for model in networks])  # what a file or a function gives may have another's name
     scenes = [place.scene for place in places]
-    tasks = tuple(judging.shown(made.on(network), network, scenes, config) for network in networks)
+    tasks = tuple(
+        judging.calibrate_task(made.on(network), network, scenes, config.label, config.judge, config.image_settings)
+        for network in networks
+    )
     warnings += [remark for task in tasks for remark in task.remarks]
     tasks = tuple(map(each_thing, tasks)) if config.judge == ALL else tasks
     own = {place.object: place.scene.description.object.label for place in places}

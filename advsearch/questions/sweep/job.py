@@ -16,10 +16,11 @@ from advsearch.attacks.domain import Seeds
 from advsearch.controls import Control, Space, make_control, make_space
 from advsearch.engine.image_changes import AWAY, as_claimed, changed
 from advsearch.engine.journal import Journal, Sent, Shared
-from advsearch.engine.judging import Metrics, check_truth, domain_of, facts_of
+from advsearch.engine.judging import Metrics, check_truth, domain_of
 from advsearch.engine.loading import Scene, framed, make_renderer
 from advsearch.engine.problem import Prepared, Problem
 from advsearch.engine.record import rate_of
+from advsearch.engine.rendering import facts_about
 from advsearch.engine.verifier import Verifier, ladder_of
 from advsearch.errors import InputError
 from advsearch.models import Model
@@ -171,7 +172,8 @@ class Job:
         return Points(space, domain, self.axes, self.samples, config.sampler, config.seed, scenes, len(self.places))
 
     def facts(self, place: NamedScene, values: Mapping[str, Value]) -> Facts:
-        return facts_of(place.scene, place.object, self.config, lambda: values, None)
+        description, config = place.scene.description, self.config
+        return facts_about(description, place.object, config.label, lambda: values, judge=config.judge)
 
 
 def check_scenes(places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]) -> None:
@@ -206,7 +208,7 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     for scene, place in enumerate(job.places):
         bound += [(place, points) for points in job.bound(scene).values()]
         for task, model in zip(job.tasks, job.models, strict=True):
-            check_truth(task, model, place.scene, job.facts(place, {}), job.config)
+            check_truth(task, model, place.scene, job.facts(place, {}), job.config.image_settings)
     first = bound[0][1]
     for place, points in bound:
         if points.drawn_numbers != first.drawn_numbers:
@@ -231,7 +233,8 @@ class SweptScene:
         self.number, self.job, self.points = number, job, job.bound(number)
         self._without: dict[tuple[int, int], Renderer] = {}
         self.renderers = {size: self._renderer(size) for size in self.points}
-        facts, spp, seed = partial(facts_of, place.scene, place.object, config), job.spp, config.seed
+        facts = partial(facts_about, place.scene.description, place.object, config.label, judge=config.judge)
+        spp, seed = job.spp, config.seed
         self.problems = tuple(
             Problem(
                 self.renderers[size], self.points[size].space, model, task, facts, None, spp, seed, metrics=job.metrics
@@ -366,7 +369,8 @@ def check_worst(
     stored already are not made again."""
     if config.trials == 0:
         return None
-    verifier = Verifier(Journal(run, Shared(problem)), ladder_of(config), stages, sought=False)
+    ladder = ladder_of(config.verify_spp, config.pixel_sampler)
+    verifier = Verifier(Journal(run, Shared(problem)), ladder, stages, sought=False)
     verifier.choose_spp({"worst": u})
     verifier.begin("checking the worst configuration with fresh renders", config.trials)
     spp, count = verifier.findings.spp, verifier.findings.sample_count

@@ -81,8 +81,9 @@ class BasisPictures:
     bytes = 0
     """Memory of what groups share."""
 
-    def __init__(self, renderer: Renderer) -> None:
-        self._renderer, self._moving = renderer, lighting(renderer)
+    def __init__(self, renderer: Renderer, seed: int) -> None:
+        self._renderer = renderer
+        self._moving = lighting(renderer)
         self.follows, self.moves = frozenset(self._moving.groups), any(self._moving.groups.values())
 
     def find_refusal(self, fall: Fall, spp: int) -> Refusal | None:
@@ -104,7 +105,7 @@ class BasisPictures:
             )
         return None
 
-    def made(self, u: Tensor, seed: int) -> Predictor:
+    def make_predictor(self, u: Tensor, seed: int) -> Predictor:
         """Return what predicts the pictures that have everything else in common with a configuration."""
         return BasisRenderer(self._renderer, u, seed, moving=self._moving)
 
@@ -161,7 +162,7 @@ class LightOnSurfaces:
             )
         return None
 
-    def made(self, u: Tensor, seed: int) -> Predictor:
+    def make_predictor(self, u: Tensor, seed: int) -> Predictor:
         with torch.no_grad():
             inputs = self._renderer.scene.assembly(self._renderer.space.inputs(u))
             arranged = next((one for one in self._arranged if one.stands(inputs)), None)
@@ -208,24 +209,31 @@ class PredictedSweep:
     _held: dict[int, Predictor | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Choose basis pictures where they pay, or light on surfaces."""
         self.renderer = self.problem.renderer
+        self.method, self.refusal = self._choose_method()
+        self._groups = self._fall(self.method.follows)
 
-        def find_refusal(way: BasisPictures | LightOnSurfaces) -> Refusal | None:
-            if not way.moves:
-                return NOTHING_MOVES
-            if self.renderer.composed or not self.specialise:
-                return Refusal(self.renderer.composed or "nothing is left out")
-            return way.find_refusal(self._fall, self.problem.spp)
+    def _choose_method(self) -> tuple[BasisPictures | LightOnSurfaces, Refusal | None]:
+        """Return the cheapest method that pays here, without a refusal.
 
-        self.way: BasisPictures | LightOnSurfaces = BasisPictures(self.renderer)
-        self.refusal = find_refusal(self.way)
-        if self.refusal is not None:
-            surfaces = LightOnSurfaces(self.renderer, self.seed)
-            refusal = find_refusal(surfaces)
-            if refusal is None or self.refusal is NOTHING_MOVES:
-                self.way, self.refusal = surfaces, refusal
-        self._groups = self._fall(self.way.follows)
+        If none does, return the first that could follow something that varies, and why it is not used.
+        """
+        refused: list[tuple[BasisPictures | LightOnSurfaces, Refusal]] = []
+        for method_type in (BasisPictures, LightOnSurfaces):  # cheapest first
+            method = method_type(self.renderer, self.seed)
+            refusal = self._find_refusal(method)
+            if refusal is None:
+                return method, None
+            refused.append((method, refusal))
+        return next((pair for pair in refused if pair[1] is not NOTHING_MOVES), refused[-1])
+
+    def _find_refusal(self, method: BasisPictures | LightOnSurfaces) -> Refusal | None:
+        """Return why a method does not predict these pictures; None if it does."""
+        if not method.moves:
+            return NOTHING_MOVES
+        if self.renderer.composed or not self.specialise:
+            return Refusal(self.renderer.composed or "nothing is left out")
+        return method.find_refusal(self._fall, self.problem.spp)
 
     def _fall(self, follows: frozenset[str]) -> Groups:
         of_grid = [axis.name for axis in self.axes]
@@ -247,7 +255,7 @@ class PredictedSweep:
         for predictor, numbers in waiting.items():
             predicted = predictor.pictures([asked[number].u for number in numbers])
             for number, picture in zip(numbers, predicted, strict=True):
-                pictures[number] = SweptPicture(picture, self.way.samples, self._spent_on(number))
+                pictures[number] = SweptPicture(picture, self.method.samples, self._spent_on(number))
         return pictures
 
     def _spent_on(self, number: int) -> int:
@@ -263,7 +271,7 @@ class PredictedSweep:
             self._held.pop(next(iter(self._held)))
         begun = time.perf_counter()
         seed = seeds.stream(self.seed, "light", self.before + group)
-        made = self.way.made(self._configuration(number, 0), seed)
+        made = self.method.make_predictor(self._configuration(number, 0), seed)
 
         def margin(picture: Tensor, u: Tensor) -> float:
             return self.problem.judge(to_8_bit(picture), u).margin
@@ -303,10 +311,10 @@ class PredictedSweep:
         several = f"{len(self.left)} of {self._groups.count} groups were rendered: predicted pictures were too far off"
         return LinearTransport(
             used=True,
-            way=self.way.name,
+            way=self.method.name,
             reason=several if self.left else None,
             entries=0,
-            bytes=self.way.bytes + sum(one.bytes for one in self._held.values() if one is not None),
+            bytes=self.method.bytes + sum(one.bytes for one in self._held.values() if one is not None),
             seconds=self.seconds,
             renewed=0,
             error=None if worst is None else PredictionError.of(worst),

@@ -225,7 +225,7 @@ def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) ->
     if added is not None:
         return planned
     for name, claim in suite.claims.items():
-        claim_config = suite.config_of(name, **changes).with_only_here(config.only_here)
+        claim_config = suite.config_of(name, **changes).with_python_parts_of(config)
         planned.append(PlannedClaim(name, claim.claim, claim_config))
     known = [*(claim.name for claim in planned), COUNTEREXAMPLES]
     for name in config.chosen:

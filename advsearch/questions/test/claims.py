@@ -373,4 +373,4 @@ def _same_picture(_query: workbench.Query, picture: Tensor) -> Tensor:
 
 def spp_of(config: SceneConfig) -> int:
     assert isinstance(config, suites.DrawnConfig)
-    return workbench.ladder_of(AttackConfig.of(config, verify_spp=config.verify_spp))[0]
+    return workbench.ladder_of(config.verify_spp, config.pixel_sampler)[0]

@@ -34,7 +34,7 @@ from advsearch.errors import AdvsearchError
 from advsearch.models.model import ModelWarning
 from advsearch.options import OUT_OF_VIEW
 from advsearch.progress import NullProgress
-from advsearch.questions.attack.carry_out import attack_once
+from advsearch.questions.attack.run import attack_once
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.report.evidence import claims_of
 from advsearch.questions.report.recorded import made_with, recorded_settings

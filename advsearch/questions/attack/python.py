@@ -1,0 +1,212 @@
+"""`advsearch.attack`: an attack on what a session has: scenes, models, controls, tasks, objectives and policies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from torch import Tensor
+
+from advsearch import losses
+from advsearch.api.keywords import Names, SceneKeywords, asks
+from advsearch.attacks import Policy, make_policy
+from advsearch.attacks.objectives import OBJECTIVE_KINDS
+from advsearch.config import SceneConfig
+from advsearch.engine import judging, loading, naming
+from advsearch.engine.judging import Metric
+from advsearch.engine.loading import Controls, Scene
+from advsearch.engine.naming import AnyModel, model_name, several
+from advsearch.errors import InputError
+from advsearch.options import as_setting, told
+from advsearch.progress import Watched, watcher
+from advsearch.questions.attack.carry_out import (
+    AttackParts,
+    controls_given,
+    is_named,
+    models_as_one,
+    task_and_objective,
+)
+from advsearch.questions.attack.result import AttackResult
+from advsearch.questions.attack.run import run_attack
+from advsearch.questions.attack.settings import AttackConfig
+from advsearch.runs.directory import begun, is_run, run_path
+from advsearch.settings import PythonOnly
+from advsearch.tasks import AnyTask, OwnTask, Task, make_task
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+class AttackKeywords(SceneKeywords, total=False):
+    """Settings that `attack` takes as keywords, besides its own arguments."""
+
+    spp: int | Literal["auto"] | None
+    epsilon: float | Mapping[str, Any] | tuple[float, ...] | None
+    norm: Literal["linf", "l2"] | None
+    estimators: str | Mapping[str, str]
+    ensemble: Literal["mean", "worst"] | None
+    measure: Literal["no", "quick", "full"]
+    steps: int | None
+    seconds: float | None
+    target: Path | Names | None
+    minimise: bool
+    smallest: bool
+    printable: bool
+    draws: int | None
+    average: int
+    baseline: bool
+    trials: int | None
+
+
+@asks(AttackConfig)
+def attack(
+    scene: Scene | str | Path | Mapping[str, object],
+    model: AnyModel | Sequence[AnyModel] = "reference",
+    *,
+    object: str | None = None,
+    task: AnyTask = "classification",
+    controls: Controls = ("texture",),
+    objective: str | Callable[..., Tensor] | None = None,
+    policy: str | Mapping[str, object] | Policy[Any] = "auto",
+    over: Controls = (),
+    metrics: Mapping[str, str | Metric] | None = None,
+    run: str | Path | None = None,
+    resume: bool = False,
+    progress: Watched = None,
+    **settings: Unpack[AttackKeywords],
+) -> AttackResult:
+    """Search for the worst configuration of a scene, verify it, and return everything that is known about it.
+
+    All other arguments are the settings of `advsearch attack`; `environment`, `up`, `set` and `exposure` belong to a
+    scene that is named here, not to one that is loaded.
+
+    Args:
+        scene: from `load_scene`, or what that takes.
+        model: from `load_model`, or what that takes; with `ensemble`, several.
+        object: the node or shape that is the object, where `scene` is a file or dictionary that holds several.
+        task: what judges the model's output: a name, a mapping with a `name` and options, an instance, or a function
+            (output, truth) that says how wrong it is, over 0 where it is wrong (docs/tasks.md).
+        controls: what may vary: names, instances, or a mapping from names to settings.
+        objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score", or a function of (output,
+            images (N, H, W, 3), truth, or the target where there is one) or of (output, labels) that returns (N,)
+            values, which are maximised; in classification the output is logits (N, C) and the truth the index of the
+            right label, (N,), or a tuple of several. It may ask for more by the names of further parameters: `u`,
+            `texture`, `inputs`, `configuration` (docs/own-loss.md). None takes the task's own.
+        policy: a name, a mapping with a `name` and options, or an instance.
+        over: controls that vary by chance: the configuration has to hold for all of their values.
+        metrics: columns of the rows, by name: functions of (image (H, W, 3) sRGB in [0, 1], output of that picture,
+            truth: the index of the right class) that return a number or a dict. `workers` need functions of a module.
+        run: folder to keep the run in; None keeps it in memory only.
+        resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
+            was.
+    """
+    options: dict[str, Any] = {name: value for name, value in settings.items() if value is not None}
+    task = make_task(task) if callable(task) else task
+    if not isinstance(policy, (str, Mapping, Policy)) or not policy:
+        raise InputError(
+            f"policy: expected a name, a mapping with a `name` and options, or an instance, got {told(policy)}"
+        )
+    own_controls = [*loading.only_here(controls), *loading.only_here(over)]
+    are_named = all(isinstance(named, (str, Path)) for named in (scene, *several(model)))
+    if not are_named or callable(objective) or own_controls or isinstance(task, OwnTask):
+        naming.check_not_spread(options)
+    scene = _load_scene(scene, object, options)
+
+    # What `run.yaml` states. Objects of the caller have the names that they are shown by.
+    objective_name = _name_objective(objective) if callable(objective) else objective
+    described = {
+        **loading.scene_as_settings(scene),
+        "model": ",".join(map(model_name, several(model))),
+        "controls": loading.settings_of(controls),
+        "over": loading.settings_of(over),
+        "task": as_setting(task) if isinstance(task, Task) else task,
+        "objective": objective_name,
+        "policy": as_setting(policy) if isinstance(policy, Policy) else policy,
+        "metrics": judging.metrics_as_settings(metrics or {}),
+    }
+    if options.get("exposure"):  # the option says it
+        described["set"].pop("camera.exposure", None)
+    config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
+    losses.check_aim(objective, targeted=config.target is not None)
+
+    only_here = [PythonOnly("model", model_name(network)) for network in several(model) if naming.exists_here(network)]
+    only_here += [PythonOnly("scene")] if scene.only_here else []
+    if isinstance(task, Task) and not is_named(task, make_task):
+        only_here.append(PythonOnly("task", task.name))
+    only_here += [PythonOnly("objective", str(objective_name))] if callable(objective) else []
+    if isinstance(policy, Policy) and not is_named(policy, _make_policy):
+        only_here.append(PythonOnly("policy", policy.name))
+    only_here += [PythonOnly("control", name) for name in own_controls]
+    only_here += [PythonOnly("metric", name) for name in judging.only_here(config.metrics)]
+    config = config.with_only_here(only_here)
+    _check_single(config)
+
+    searched, drawn = controls_given(config, controls, over)
+    if not isinstance(policy, Policy):
+        policy = make_policy(config.policy_name, **config.policy_options)
+    loaded_task, objective = task_and_objective(
+        config, task if isinstance(task, Task) else config.task, objective if callable(objective) else config.objective
+    )
+    stopped = run_path(run) if resume and run is not None and is_run(run_path(run)) else None
+    with begun(config) if run is not None and stopped is None else nullcontext(stopped) as folder:
+        parts = AttackParts(
+            config,
+            scene,
+            loaded=models_as_one(model, config, loaded_task),
+            task=loaded_task,
+            controls=searched,
+            over=drawn,
+            objective=objective,
+            policy=policy,
+            keep=run is not None,
+            metrics=judging.load_metrics(config.metrics, metrics),
+        )
+        return run_attack(parts, watcher(progress), folder)
+
+
+def _load_scene(
+    scene: Scene | str | Path | Mapping[str, object], shape: str | None, options: Mapping[str, Any]
+) -> Scene:
+    """Return a scene, loaded with the options that belong to it; `shape` is its object where it holds several."""
+    if isinstance(scene, Scene):
+        naming.check_not_of_scene({**options, "object": shape})
+        return scene
+    of_scene = {name: options[name] for name in naming.OF_SCENE if name in options}
+    config = SceneConfig(**{"object": "mug", **of_scene})
+    environment, keywords = config.environment, naming.told_of_scene(config)
+    if shape is not None:
+        return loading.load_scene(shape, environment, scene=scene, **keywords)
+    if isinstance(scene, Mapping):
+        raise InputError("object: which shape of the scene is it? Give its id")
+    return loading.load_scene(scene, environment, **keywords)
+
+
+def _name_objective(objective: Callable[..., Tensor]) -> str:
+    """Name an objective of the caller, never as one of the built-in ones."""
+    name = str(getattr(objective, "__name__", None) or type(objective).__name__)
+    return f"own {name}" if name in OBJECTIVE_KINDS else name
+
+
+def _make_policy(setting: Any) -> Policy[Any]:
+    """Make the policy that a setting names."""
+    config = AttackConfig(object="mug", policy=setting)
+    return make_policy(config.policy_name, **config.policy_options)
+
+
+def _check_single(config: AttackConfig) -> None:
+    """Refuse settings of several attacks, and those that need a run directory or workers and cannot have them."""
+    if config.workers is not None or config.cluster is not None:
+        judging.check_shared(config.metrics)
+    if config.is_matrix and config.ensemble is None:
+        raise InputError(
+            "model: expected one, got several; add `ensemble`, which attacks them together, or attack each by itself"
+        )
+    if config.epsilons:
+        listed = ", ".join(f"{epsilon:g}" for epsilon in config.epsilons)
+        raise InputError(
+            f"epsilon: expected one, got {listed}; attack with each, or have `advsearch attack` draw the curve"
+        )
+    if config.aov is not None and config.run is None:
+        raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
