@@ -43,6 +43,11 @@ class Prediction:
     index: int | None = None
     probability: float | None = None
 
+    @property
+    def is_out_of_view(self) -> bool:
+        """Whether nothing of what is judged can be seen in the picture."""
+        return self.label == OUT_OF_VIEW
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -84,11 +89,6 @@ class Judgement:
     def not_a_number(self) -> bool:
         """Whether the model returned NaN or infinity, which is neither right nor a success."""
         return self.prediction.label == NOT_A_NUMBER
-
-    @property
-    def out_of_view(self) -> bool:
-        """Whether the object is not in the picture, so that the prediction is neither right nor wrong."""
-        return self.prediction.label == OUT_OF_VIEW
 
 
 Said = tuple[Prediction, JsonValue]  # what a model says of a picture, and what else is kept of it
