@@ -215,21 +215,6 @@ def plain(value: Any) -> Any:
     raise TypeError(f"expected something that JSON can hold, got {type(value).__name__}")
 
 
-class ConditionRow(Fields):
-    """A part of the values of one parameter."""
-
-    parameter: str
-    unit: str
-    over: float | None = Field(description="values are larger; null without that bound, and for names")
-    at_most: float | None = Field(description="values are no larger; null without that bound, and for names")
-    options: list[str] = Field(description="the names it is about; empty for numbers")
-    turn: float | None = optional(
-        "degrees after which values count as the same, 180 or 360; `over` may then be over `at_most`: the "
-        "part goes through 0. Null for other parts"
-    )
-    text: str
-
-
 AxisValue = int | float | str | tuple[float, float]  # a number, a name, or both ends of a part of a range
 
 
@@ -246,6 +231,21 @@ class CountedPredictions(Fields):
     outcomes: Outcomes = optional(f"{WHAT_BECOMES} in the other ones; {ONLY_OF_BOXES}")
 
 
+class ConditionRow(Fields):
+    """A part of the values of one parameter."""
+
+    parameter: str
+    unit: str
+    over: float | None = Field(description="values are larger; null without that bound, and for names")
+    at_most: float | None = Field(description="values are no larger; null without that bound, and for names")
+    options: list[str] = Field(description="the names it is about; empty for numbers")
+    turn: float | None = optional(
+        "degrees after which values count as the same, 180 or 360; `over` may then be over `at_most`: the "
+        "part goes through 0. Null for other parts"
+    )
+    text: str
+
+
 class Extent(Fields):
     """A count with the interval of its share."""
 
@@ -258,7 +258,11 @@ class Extent(Fields):
     )
 
     @classmethod
+<<<<<<< HEAD
     def from_count(
+=======
+    def of(  # type: ignore[override]
+>>>>>>> w-b
         cls, what: str, count: int, total: int, interval: Interval | None, share: float | None = None
     ) -> Extent:
         """Return a count with the interval of its share, which is `share` where that is not count over total."""

@@ -95,11 +95,6 @@ class Judgement:
         """Whether the model returned NaN or infinity, which is neither right nor a success."""
         return self.prediction.label == NOT_A_NUMBER
 
-    @property
-    def out_of_view(self) -> bool:
-        """Whether the object is not in the picture, so that the prediction is neither right nor wrong."""
-        return self.prediction.label == OUT_OF_VIEW
-
 
 Said = tuple[Prediction, JsonValue]  # what a model says of a picture, and what else is kept of it
 

@@ -209,7 +209,7 @@ class RegionSearch:
         predictor = None if self._is_checking else self._verifier.findings.transport
         u = self._varied.place(values)
         (trial,) = self._verifier.trials("region", {number: u}, sought=False, predictor=predictor)
-        is_counted = not trial.out_of_view and not trial.not_a_number
+        is_counted = not trial.prediction.is_out_of_view and not trial.not_a_number
         return is_counted and trial.success == self._centre_verdict
 
 
@@ -221,7 +221,7 @@ def find_verdict(verifier: workbench.Verifier, centre: Tensor) -> bool:
     """
     verifier.stages.begin("verification", "looking at the centre", CENTRE_TRIALS)
     trials = list(verifier.trials("centre", dict.fromkeys(range(CENTRE_TRIALS), centre), sought=False))
-    n_hidden = sum(trial.out_of_view for trial in trials)
+    n_hidden = sum(trial.prediction.is_out_of_view for trial in trials)
     if n_hidden:
         raise InputError(
             f"the object is not to be seen in {n_hidden} of {CENTRE_TRIALS} trials at the centre, so there is no "
