@@ -258,11 +258,7 @@ class Extent(Fields):
     )
 
     @classmethod
-<<<<<<< HEAD
     def from_count(
-=======
-    def of(  # type: ignore[override]
->>>>>>> w-b
         cls, what: str, count: int, total: int, interval: Interval | None, share: float | None = None
     ) -> Extent:
         """Return a count with the interval of its share, which is `share` where that is not count over total."""
