@@ -64,9 +64,9 @@ from advsearch.pictures import upright as upright
 from advsearch.progress import NullProgress as NullProgress
 from advsearch.progress import Watched as Watched
 from advsearch.progress import watcher as watcher
-from advsearch.questions.attack.carry_out import AttackParts as AttackParts
 from advsearch.questions.attack.carry_out import LOADING as LOADING
 from advsearch.questions.attack.carry_out import ROLES_IN_SEARCH as ROLES_IN_SEARCH
+from advsearch.questions.attack.carry_out import AttackParts as AttackParts
 from advsearch.questions.attack.carry_out import check_from_config as check_from_config
 from advsearch.questions.attack.carry_out import executor_for as executor_for
 from advsearch.questions.attack.carry_out import judged_alone as judged_alone
