@@ -79,7 +79,7 @@ def attacked(config: AttackConfig, problem: Any = None) -> tuple[Recorded, Findi
     progress = Recorded()
     problem = problem or StandInProblem()
     policy = make_policy(config.policy_name)
-    return progress, attack_on(problem, config, policy, Stages(progress)).carry_out()
+    return progress, attack_on(problem, config, policy, Stages(progress))
 
 
 @pytest.mark.parametrize("policy", ["pgd", "auto", "random", "cmaes"])

@@ -46,7 +46,6 @@ _ALIGNED = re.compile(r"rendering-([0-9]{1,12})(?:-.*)?")
 
 
 @workbench.helped
-@workbench.in_turn()
 def photo_agreement(run: str | Path) -> PhotoAgreement:
     """Return how the photographs that were taken for a run agree with its renderings (docs/viewer.md).
 
