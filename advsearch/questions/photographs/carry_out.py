@@ -57,7 +57,7 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
         FileFormatError: what was kept of a photograph is something else.
     """
     kept, rows = ["rendering", "right", "label", "file"], list[dict[str, object]]()
-    with Store.open_to_read(find_run(run)) as store:
+    with workbench.in_turn(), Store.open_to_read(find_run(run)) as store:
         for row in store.rows(PHOTO):
             if not {*kept} <= (photo := _photo_of(row)).keys():
                 raise FileFormatError(f"row {row.id}: expected what was kept of a photograph, got something else")
