@@ -20,10 +20,9 @@ from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar, get_args, get_type_hints
 
 from advsearch import registry, threads
-from advsearch.errors import FELL_SHORT
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress, Stages, watcher
-from advsearch.report.shown import Claim, ShownResult, result_figure, shown
+from advsearch.report.views import Claim, ShownResult, result_figure, shown
 from advsearch.runs.directory import CONFIG, RunDirectory, begun, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.runs.measurements import Measurements
@@ -206,11 +205,6 @@ class PositionalArgument(NamedTuple):
     expected: str  # completes "expected ..." where it is missing
     more: str = ""  # what the help adds
     many: bool = False  # whether there may be several
-
-
-def fail_check(falls_short: Callable[[Any], bool]) -> Callable[[Any], int]:
-    """Return an `exit_status` that is 3 where a check falls short, and else 0."""
-    return lambda result: FELL_SHORT if falls_short(result) else 0
 
 
 def succeed(result: Any) -> int:

@@ -14,19 +14,16 @@ from typing import TYPE_CHECKING, Any
 from advsearch import __version__ as __version__
 
 if TYPE_CHECKING:
+    from advsearch import errors as errors
     from advsearch import models as models
     from advsearch import rules as rules
     from advsearch import seeds as seeds
     from advsearch import settings as settings
     from advsearch import statistics as statistics
     from advsearch import tasks as tasks
+    from advsearch.api import exports as exports
     from advsearch.api import workbench as workbench
-    from advsearch.api.export import AdversarialRun as AdversarialRun
-    from advsearch.api.rendered_rows import render_rows as render_rows
-    from advsearch.attacks import Domain as Domain
-    from advsearch.attacks import Evaluation as Evaluation
     from advsearch.attacks import Policy as Policy
-    from advsearch.attacks import Proposal as Proposal
     from advsearch.attacks import policies as policies
     from advsearch.config import DerivativeConfig as DerivativeConfig
     from advsearch.config import SceneConfig as SceneConfig
@@ -41,87 +38,66 @@ if TYPE_CHECKING:
     from advsearch.controls.support.picture_control import PictureControl as PictureControl
     from advsearch.engine import gradients as gradients
     from advsearch.engine.problem import Problem as Problem
-    from advsearch.errors import AdvsearchError as AdvsearchError
-    from advsearch.errors import FileFormatError as FileFormatError
     from advsearch.errors import InputError as InputError
-    from advsearch.errors import ModelError as ModelError
-    from advsearch.errors import UnknownNameError as UnknownNameError
     from advsearch.experiment import PositionalArgument as PositionalArgument
     from advsearch.experiment import RunContext as RunContext
     from advsearch.experiment import experiment as experiment
-    from advsearch.experiment import fail_check as fail_check
     from advsearch.models import Model as Model
     from advsearch.options import Value as Value
     from advsearch.progress import Progress as Progress
     from advsearch.questions.attack.settings import AttackConfig as AttackConfig
     from advsearch.questions.sweep.settings import SweepConfig as SweepConfig
-    from advsearch.registry import get_experiment as get_experiment
     from advsearch.report import figures as figures
+    from advsearch.report import views as views
     from advsearch.report import wording as wording
-    from advsearch.report.shown import Claim as Claim
-    from advsearch.report.shown import Column as Column
-    from advsearch.report.shown import InNotebook as InNotebook
-    from advsearch.report.shown import Picture as Picture
-    from advsearch.report.shown import ResultPart as ResultPart
-    from advsearch.report.shown import ShownResult as ShownResult
+    from advsearch.report.views import ResultPart as ResultPart
+    from advsearch.report.views import ShownResult as ShownResult
     from advsearch.runs import directory as directory
     from advsearch.runs import results as results
     from advsearch.runs.directory import RunDirectory as RunDirectory
-    from advsearch.runs.directory import find_run as find_run
     from advsearch.runs.exporters import Exported as Exported
     from advsearch.runs.exporters import Exporter as Exporter
-    from advsearch.runs.results import Fields as Fields
-    from advsearch.runs.results import Interval as Interval
     from advsearch.runs.results import RunResult as RunResult
     from advsearch.runs.store import Store as Store
     from advsearch.runs.summary import read_result as read_result
     from advsearch.scene import assets as assets
     from advsearch.scene import color as color
     from advsearch.scene import geometry as geometry
-    from advsearch.scene import library as library
     from advsearch.scene import parts as parts
     from advsearch.scene.description import SceneDescription as SceneDescription
     from advsearch.scene.importing import reading as reading
     from advsearch.scene.mitsuba_backend import mitsuba_data as mitsuba_data
-    from advsearch.settings import Clash as Clash
     from advsearch.settings import Config as Config
     from advsearch.settings import setting as setting
     from advsearch.settings import setting_as_in as setting_as_in
-    from advsearch.tasks import Facts as Facts
-    from advsearch.tasks import Judgement as Judgement
-    from advsearch.tasks import Prediction as Prediction
     from advsearch.tasks import Task as Task
     from advsearch.trust import stored_files as stored_files
     from advsearch.trust import writing as writing
     from advsearch.viewer import markup as markup
-    from advsearch.viewer import thumbnails as thumbnails
 
 _NAMES = {
-    "advsearch.api.export": ("AdversarialRun",),
-    "advsearch.api.rendered_rows": ("render_rows",),
-    "advsearch.attacks": ("Domain", "Evaluation", "Policy", "Proposal"),
+    "advsearch.attacks": ("Policy",),
     "advsearch.config": ("DerivativeConfig", "SceneConfig"),
     "advsearch.controls.base": ("Choice", "Control", "Parameter", "Values"),
     "advsearch.controls.ranges": ("Fixed", "OneOf", "Range"),
     "advsearch.controls.support.picture_control": ("PictureControl",),
     "advsearch.engine.problem": ("Problem",),
-    "advsearch.errors": ("AdvsearchError", "FileFormatError", "InputError", "ModelError", "UnknownNameError"),
-    "advsearch.experiment": ("PositionalArgument", "RunContext", "experiment", "fail_check"),
+    "advsearch.errors": ("InputError",),
+    "advsearch.experiment": ("PositionalArgument", "RunContext", "experiment"),
     "advsearch.models": ("Model",),
     "advsearch.options": ("Value",),
     "advsearch.progress": ("Progress",),
     "advsearch.questions.attack.settings": ("AttackConfig",),
     "advsearch.questions.sweep.settings": ("SweepConfig",),
-    "advsearch.registry": ("get_experiment",),
-    "advsearch.report.shown": ("Claim", "Column", "InNotebook", "Picture", "ResultPart", "ShownResult"),
-    "advsearch.runs.directory": ("RunDirectory", "find_run"),
+    "advsearch.report.views": ("ResultPart", "ShownResult"),
+    "advsearch.runs.directory": ("RunDirectory",),
     "advsearch.runs.exporters": ("Exported", "Exporter"),
-    "advsearch.runs.results": ("Fields", "Interval", "RunResult"),
+    "advsearch.runs.results": ("RunResult",),
     "advsearch.runs.store": ("Store",),
     "advsearch.runs.summary": ("read_result",),
     "advsearch.scene.description": ("SceneDescription",),
-    "advsearch.settings": ("Clash", "Config", "setting", "setting_as_in"),
-    "advsearch.tasks": ("Facts", "Judgement", "Prediction", "Task"),
+    "advsearch.settings": ("Config", "setting", "setting_as_in"),
+    "advsearch.tasks": ("Task",),
 }
 """The names of the interface, by the module that each is imported from."""
 
@@ -129,11 +105,12 @@ _MODULES = {
     "assets": "advsearch.scene.assets",
     "color": "advsearch.scene.color",
     "directory": "advsearch.runs.directory",
+    "errors": "advsearch.errors",
+    "exports": "advsearch.api.exports",
     "figures": "advsearch.report.figures",
     "geometry": "advsearch.scene.geometry",
     "gradients": "advsearch.engine.gradients",
     "images": "advsearch.controls.support.images",
-    "library": "advsearch.scene.library",
     "markup": "advsearch.viewer.markup",
     "mitsuba_data": "advsearch.scene.mitsuba_backend.mitsuba_data",
     "models": "advsearch.models",
@@ -147,7 +124,7 @@ _MODULES = {
     "statistics": "advsearch.statistics",
     "stored_files": "advsearch.trust.stored_files",
     "tasks": "advsearch.tasks",
-    "thumbnails": "advsearch.viewer.thumbnails",
+    "views": "advsearch.report.views",
     "wording": "advsearch.report.wording",
     "workbench": "advsearch.api.workbench",
     "writing": "advsearch.trust.writing",

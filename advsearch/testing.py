@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advsearch.extend import get_experiment
+from advsearch.extend import workbench
 
 if TYPE_CHECKING:
     from advsearch.extend import workbench
@@ -124,7 +124,7 @@ def assert_suite(suite: str | Path, **settings: Any) -> SuiteResult:
     # late: torch takes long to import
     from advsearch.extend import workbench
 
-    experiment = get_experiment("test")
+    experiment = workbench.get_experiment("test")
     workbench.allow_named(settings)
     with workbench.in_turn():
         result: SuiteResult = experiment.run(experiment.settings(**{"suite": str(suite), **settings}))
@@ -147,7 +147,7 @@ def _asserted(
     from advsearch.extend import workbench
 
     loading = workbench.loading
-    experiment = get_experiment("test")
+    experiment = workbench.get_experiment("test")
     name = str(claim["claim"]).replace("_", "-")
     objects: dict[tuple[str, str], Any] = {}
     with workbench.in_turn():

@@ -137,7 +137,7 @@ def test_the_interface_states_each_name_once_for_editors_and_once_for_python() -
 
     for_python = {name: f"{module}.{name}" for name, module in extend._MODULE_OF_NAME.items()} | extend._MODULES
     assert for_editors == for_python
-    assert len(for_python) <= 67
+    assert len(for_python) <= 60
     assert all(getattr(extend, name) is not None for name in extend.__all__)
 
 

@@ -242,7 +242,7 @@ FAULTS = (
     ),
     Fault(
         "report: a page escapes nothing",
-        "advsearch/report/shown.py",
+        "advsearch/report/views.py",
         "part if isinstance(part, Html) else escape(part)",
         "part",
         ("tests/viewer/test_attack_page.py",),

@@ -92,6 +92,7 @@ from advsearch.runs.results import AxisValue as AxisValue
 from advsearch.runs.store import Row as Row
 from advsearch.runs.summary import read_configuration as read_configuration
 from advsearch.runs.tables import units_of as units_of
+from advsearch.scene import library as library
 from advsearch.scene.assembly import posed as posed
 from advsearch.scene.glb import glb as glb
 from advsearch.scene.grounds import paved as paved

@@ -210,7 +210,7 @@ def shown_text(result: Result) -> str:
     """Return what is shown of a result as text: what it says, its parts, by what it came about, and notes."""
     # late, so that --help answers at once
     from advsearch.cli.flags import with_flags
-    from advsearch.report.shown import facts_of, remarks_of, shown
+    from advsearch.report.views import facts_of, remarks_of, shown
     from advsearch.runs.directory import REPORT
 
     content, run = shown(result), getattr(result, "run", None)

@@ -82,9 +82,9 @@ def report(args: argparse.Namespace) -> int:
 
 def _take_in(folder: str, name: str) -> None:
     """Have a run's model judge the photographs in a folder that the run does not have yet."""
-    from advsearch.extend import directory, find_run, settings, workbench  # the last brings torch
+    from advsearch.extend import directory, settings, workbench  # the last brings torch
 
-    run = find_run(name)
+    run = directory.find_run(name)
     task: Any = settings.read_yaml(run / directory.CONFIG).get("task") or "classification"
     with tempfile.TemporaryDirectory() as named:
         place = Path(folder)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from advsearch.extend import Choice, Control, InputError, Parameter, UnknownNameError, Value, Values, parts
+from advsearch.extend import Choice, Control, InputError, Parameter, Value, Values, errors, parts
 
 
 class BodyControl(Control):
@@ -44,7 +44,7 @@ class BodyControl(Control):
             return clips[0] if clips and timed else None
         number = int(asked) if Parameter.is_number(asked) or str(asked).isdigit() else -1
         if asked not in clips and not 0 <= number < len(clips):
-            raise UnknownNameError(f"{self.name}.clip", str(asked), clips, f"Animations of {self.mesh}.")
+            raise errors.UnknownNameError(f"{self.name}.clip", str(asked), clips, f"Animations of {self.mesh}.")
         return str(asked) if asked in clips else clips[number]
 
     def fit(self) -> None:
@@ -52,7 +52,7 @@ class BodyControl(Control):
         for name in self.specs:
             if name not in known:
                 where = f"It stands in `controls` {self.name}."
-                raise UnknownNameError(f"parameter of {self.mesh}", name, known, where)
+                raise errors.UnknownNameError(f"parameter of {self.mesh}", name, known, where)
         if not self._given and not any(self.in_scene(parameter).search for parameter in self.parameters):
             example = next((name for name in known if name.endswith(".x")), known[0])
             raise InputError(

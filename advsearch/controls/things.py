@@ -28,9 +28,9 @@ from advsearch.extend import (
     Parameter,
     Range,
     SceneDescription,
-    UnknownNameError,
     Value,
     Values,
+    errors,
     geometry,
     parts,
 )
@@ -77,7 +77,7 @@ class ThingsControl(Control):
             raise InputError(f"`controls` {self.name}: nothing stands beside the object; add `things`, such as car@6,3")
         for name in (one.rpartition(".")[0] for one in self.specs):
             if name and name not in things:
-                raise UnknownNameError(f"`controls` {self.name}: thing beside the object", name, things)
+                raise errors.UnknownNameError(f"`controls` {self.name}: thing beside the object", name, things)
         super().fit()
         asked = set()
         for slot in self.slots:

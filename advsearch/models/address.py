@@ -35,7 +35,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.extend import InputError, Model, ModelError, UnknownNameError, models, stored_files
+from advsearch.extend import InputError, Model, errors, models, stored_files
 
 CHAT = "/chat/completions"  # how the path of an address ends that is asked as OpenAI's chat is
 
@@ -98,7 +98,7 @@ def load(spec: str, purpose: models.Purpose) -> Model:
     if not free:
         asked.names = purpose.names or tuple(asked.scores([np.full((models.SIDE, models.SIDE, 3), 128, np.uint8)])[0])
         if len(asked.names) < 2:
-            raise ModelError(f"model {name}: expected scores of two names at least, got {len(asked.names)}")
+            raise errors.ModelError(f"model {name}: expected scores of two names at least, got {len(asked.names)}")
     return Model(
         module=asked,
         name=name,
@@ -113,7 +113,7 @@ def limits_of(ask: Mapping[str, float]) -> dict[str, float]:
     """Return every limit, as asked or by default. Raises InputError where a name is unknown, or a number below 0."""
     for name, value in ask.items():
         if name not in LIMITS:
-            raise UnknownNameError("name in `ask`", name, LIMITS)
+            raise errors.UnknownNameError("name in `ask`", name, LIMITS)
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= 0:
             raise InputError(f"`ask` {name}: expected a number of at least 0, got {value!r}")
     limits = {**LIMITS, **ask}
@@ -217,12 +217,12 @@ class AskedModel(models.RemoteNetwork):
         rows = []
         for answer in self._answers([(image, 0) for image in images]):
             if "scores" not in answer:
-                raise ModelError(
+                raise errors.ModelError(
                     f"model {self.name}: answers in words ({answer['text'][:60]!r}), which are no scores; use "
                     "`task=answer`, and say the right `label`"
                 )
             if self.names and (other := answer["scores"].keys() - set(self.names)):
-                raise ModelError(f"model {self.name}: says {min(other)!r}, which is none of the `labels`")
+                raise errors.ModelError(f"model {self.name}: says {min(other)!r}, which is none of the `labels`")
             rows.append(answer["scores"])
         return rows
 
@@ -329,7 +329,7 @@ class AskedModel(models.RemoteNetwork):
                 if isinstance(answer, dict):
                     yield place, answer
                     continue
-                if isinstance(answer, ModelError):
+                if isinstance(answer, errors.ModelError):
                     failed.append(str(answer))
                     continue
                 why, later, asked_to = self._failure(answer, first=self.spent["calls"] <= len(wave))
@@ -337,7 +337,7 @@ class AskedModel(models.RemoteNetwork):
                     failed.append(f"model {self.name}: {why} ({self.url})")
                 again.append((place, tries - 1, max(wait, asked_to)))
             if failed:
-                raise ModelError(failed[0])
+                raise errors.ModelError(failed[0])
             if again:
                 time.sleep(min(max(wait for _, _, wait in again), LONGEST_WAIT))
                 left = [(place, tries, 2 * wait) for place, tries, wait in again] + left
@@ -352,7 +352,7 @@ class AskedModel(models.RemoteNetwork):
                 break
             if reached:
                 name, limit = reached[0], self.limits[reached[0]]
-                raise ModelError(
+                raise errors.ModelError(
                     f"model {self.name}: {self._so_far[name]:,.10g} {name} are spent, and `ask` allows {limit:,.10g}; "
                     f"`advsearch resume RUN ask.{name}={2 * limit or 1:.10g}` goes on with more, and asks nothing twice"
                 )
@@ -388,7 +388,7 @@ class AskedModel(models.RemoteNetwork):
                 text = error.read(LONGEST_FAILURE)
                 error = urllib.error.HTTPError(error.url, error.code, error.reason, error.headers, io.BytesIO(text))
             return error
-        except (OSError, http.client.HTTPException, ModelError) as error:  # URLError is an OSError
+        except (OSError, http.client.HTTPException, errors.ModelError) as error:  # URLError is an OSError
             return error
 
     def _failure(self, error: Exception, *, first: bool) -> tuple[str, bool, float]:
@@ -445,11 +445,11 @@ class AskedModel(models.RemoteNetwork):
         text = text.replace(models.read_key(), "(key)") if models.read_key() else text
         return " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
 
-    def _wrong(self, expected: str, got: str | Mapping[str, Any]) -> ModelError:
+    def _wrong(self, expected: str, got: str | Mapping[str, Any]) -> errors.ModelError:
         """Return the error for an answer that is something else, or an object with other keys."""
         if isinstance(got, Mapping):
             got = self._clean(", ".join(map(str, got)) or "nothing")[:100]
-        return ModelError(f"model {self.name}: expected {expected}, got {got} ({self.url})")
+        return errors.ModelError(f"model {self.name}: expected {expected}, got {got} ({self.url})")
 
     def _count_tokens(self, answer: Mapping[str, Any]) -> None:
         """Count the tokens that an answer says it took. Raises ModelError where a limit needs them and it says none."""

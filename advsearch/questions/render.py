@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from advsearch.config import RenderConfig
 from advsearch.experiment import RunContext, experiment
-from advsearch.report.shown import ResultPart, ShownResult
+from advsearch.report.views import ResultPart, ShownResult
 from advsearch.report.wording import SEEN, seen_cells, seen_text, things_rows
 from advsearch.runs.results import RenderResult
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.extend import Facts, InputError, Model, Prediction, Task, tasks
+from advsearch.extend import InputError, Model, Task, tasks
 
 Words = tuple[str, ...]
 
@@ -82,10 +82,10 @@ class FreeAnswer(Task):
             return list(returned)
         raise ValueError("expected a mapping with text, logits and begins for each picture, as answers in words have")
 
-    def check(self, facts: Facts) -> None:
+    def check(self, facts: tasks.Facts) -> None:
         self.truth(facts)
 
-    def truth(self, facts: Facts) -> Words:
+    def truth(self, facts: tasks.Facts) -> Words:
         """Return the right words: what was said, or else the object's own label. Raises InputError: there are none, or
         one is the target too."""
         text = facts.own_label if facts.label is None else facts.label
@@ -118,7 +118,7 @@ class FreeAnswer(Task):
             )
         return torch.stack(losses)
 
-    def predictions(self, output: Sequence[Utterance | Texts], count: int = 1) -> list[tuple[Prediction, ...]]:
+    def predictions(self, output: Sequence[Utterance | Texts], count: int = 1) -> list[tuple[tasks.Prediction, ...]]:
         """Return the text of each picture, the most frequent first, in one line without signs that steer a terminal."""
         each = (Counter(_texts(one)).most_common(count) for one in output)
         return [tuple(_said(text) for text, _ in texts) for texts in each]
@@ -138,9 +138,9 @@ def _texts(one: Utterance | Texts) -> list[str]:
     return one["texts"] if "texts" in one else [one["text"]]  # type: ignore[typeddict-item]
 
 
-def _said(text: str) -> Prediction:
+def _said(text: str) -> tasks.Prediction:
     shown = "".join(sign if sign.isprintable() else " " for sign in text)
-    return Prediction(" ".join(shown.split()) or SILENCE)
+    return tasks.Prediction(" ".join(shown.split()) or SILENCE)
 
 
 def _words(setting: str, text: str) -> Words:

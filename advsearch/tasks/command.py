@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.extend import Facts, FileFormatError, InputError, Model, Prediction, Task, models, stored_files, tasks
+from advsearch.extend import InputError, Model, Task, errors, models, stored_files, tasks
 
 Numbers = tuple[float, ...]
 
@@ -161,11 +161,11 @@ class Command(Task):
     def goal(self) -> str:
         return "a target action" if self.target is not None else "an action outside the envelope of the clean one"
 
-    def check(self, facts: Facts) -> None:
+    def check(self, facts: tasks.Facts) -> None:
         if facts.label is not None:
             raise InputError("label: task command has no classes, the clean action is what is right; leave it out")
 
-    def truth(self, facts: Facts) -> Tensor | None:
+    def truth(self, facts: tasks.Facts) -> Tensor | None:
         self.check(facts)
         return self.clean
 
@@ -182,8 +182,8 @@ class Command(Task):
     def loss(self, output: Tensor, truth: Tensor | None) -> Tensor:
         return self._off(output, truth).abs().amax(dim=1) - 1.0
 
-    def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:
-        return [(Prediction(self._said(action)),) for action in output.tolist()]
+    def predictions(self, output: Tensor, count: int = 1) -> list[tuple[tasks.Prediction, ...]]:
+        return [(tasks.Prediction(self._said(action)),) for action in output.tolist()]
 
     def said(self, output: Tensor, truth: Tensor | None, margins: Sequence[float]) -> list[tasks.Said]:
         """See `Task.said`: whether an action left its envelope, and which element is furthest out. Beside it stand the
@@ -197,7 +197,7 @@ class Command(Task):
             label = REACHED if hit else INSIDE if margin >= 0.0 else f"action outside its envelope ({side})"
             text = f"{self._said(action)}, clean {self._said(truth.tolist(), named=False)}"
             kept = {"action": action, "clean": truth.tolist(), "envelopes": 1.0 - margin, "text": text}
-            found.append((Prediction(label), kept))
+            found.append((tasks.Prediction(label), kept))
         return found
 
     def _name(self, place: int) -> str:
@@ -239,9 +239,11 @@ def _state(given: Any) -> dict[str, Numbers]:
                 stored_files.read_text(path, "a state: numbers by name in JSON", LARGEST), finite=True
             )
         except OSError as error:
-            raise FileFormatError(f"task command: state: {path} cannot be read ({error.strerror or error})") from None
+            raise errors.FileFormatError(
+                f"task command: state: {path} cannot be read ({error.strerror or error})"
+            ) from None
         except ValueError as error:
-            raise FileFormatError(f"{path}: expected a state: numbers by name in JSON ({error})") from None
+            raise errors.FileFormatError(f"{path}: expected a state: numbers by name in JSON ({error})") from None
     if not given:
         return {}
     if not isinstance(given, Mapping) or not all(isinstance(name, str) and name for name in given):

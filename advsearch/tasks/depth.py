@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.extend import Facts, InputError, Model, Prediction, Task, tasks
+from advsearch.extend import InputError, Model, Task, tasks
 
 ASIDE = 0.1  # cosine of the angle to the camera's axis from which on z-depth is no distance any more
 DISPARITY, RELATIVE, METRIC = "relative disparity", "relative depth", "metric depth"
@@ -209,12 +209,12 @@ class Depth(Task):
             return (f"{text}, of an object of {self.size:g} m." if self.size else f"{text}.",)
         return (f"{text}, which are found by least squares on what is seen beside the object.",)
 
-    def check(self, facts: Facts) -> None:
+    def check(self, facts: tasks.Facts) -> None:
         """See `Task.check`. Raises InputError: there is a label."""
         if facts.label is not None:
             raise InputError("label: task depth has no classes; leave it out")
 
-    def truth(self, facts: Facts) -> Distances:
+    def truth(self, facts: tasks.Facts) -> Distances:
         """Return where the object is seen, and how far everything is. Raises InputError: the lens sees so far aside
         that the distance along its axis says nothing."""
         if bool((facts.z_depth < ASIDE * facts.depth).any()):
@@ -294,21 +294,21 @@ class Depth(Task):
 
     # ---- in words ---------------------------------------------------------------------------------------------------
 
-    def predictions(self, output: Sequence[Map], count: int = 1) -> list[tuple[Prediction, ...]]:
+    def predictions(self, output: Sequence[Map], count: int = 1) -> list[tuple[tasks.Prediction, ...]]:
         """Return between which numbers each map is."""
-        found: list[tuple[Prediction, ...]] = []
+        found: list[tuple[tasks.Prediction, ...]] = []
         for one in output:
             ((said, values),) = one.items()
             low, high = (float(end) for end in values.detach().aminmax())
             text = f"{self.kind or said or 'numbers'} from {low:.3g} to {high:.3g}"
-            found.append((Prediction(text if math.isfinite(low + high) else tasks.NOT_A_NUMBER),))
+            found.append((tasks.Prediction(text if math.isfinite(low + high) else tasks.NOT_A_NUMBER),))
         return found
 
     def said(self, output: Sequence[Map], truth: Distances, margins: Sequence[float]) -> list[tasks.Said]:
         """See `Task.said`; the payload has the factor by which the distance is off, what is left of the relief, and
         where scale and shift were found."""
         if not truth.seen:
-            return [(Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
+            return [(tasks.Prediction(tasks.OUT_OF_VIEW), None)] * len(output)
         found: list[tasks.Said] = []
         distance = float(truth.z[truth.mask].double().log().mean().exp())
         for one, margin in zip(output, margins, strict=True):
@@ -325,7 +325,7 @@ class Depth(Task):
             holds = {"nearer": -mean > self._bar, "farther": mean > self._bar, "gone": relief < 0.5}
             names = sorted(("gone", "nearer", "farther"), key=lambda name: name != self.seek)
             wrong = next((LABELS[name] for name in names if holds[name]), OUT_OF_SHAPE)
-            found.append((Prediction(AS_FAR if margin >= 0.0 else wrong), payload))
+            found.append((tasks.Prediction(AS_FAR if margin >= 0.0 else wrong), payload))
         return found
 
     def marks(self, output: Sequence[Map], truth: Distances) -> list[list[tasks.Mark]]:

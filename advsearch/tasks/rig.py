@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.extend import Facts, InputError, Judgement, Model, Prediction, Task, models, tasks
+from advsearch.extend import InputError, Model, Task, models, tasks
 
 RULES = ("any", "all", "mean", "vote")
 """When the rig is right: in any picture, in all, on average of the losses, or in more than half."""
@@ -73,7 +73,7 @@ class Rig(tasks.Joined):
     def seeking(self, objective: str) -> Rig:
         return replace(self, part=self.part.seeking(objective))
 
-    def check(self, facts: Facts) -> None:
+    def check(self, facts: tasks.Facts) -> None:
         self.part.check(facts)
 
     def read(self, returned: Any, count: int) -> Any:
@@ -82,7 +82,7 @@ class Rig(tasks.Joined):
     def after_calibration(self, output: Sequence[tasks.Outputs], truth: tasks.Truths | None) -> Rig:
         return replace(self, part=self.part.after_calibration(output[0][0], None if truth is None else truth[0]))
 
-    def truth(self, facts: Facts) -> tasks.Truths:
+    def truth(self, facts: tasks.Facts) -> tasks.Truths:
         return tuple(self.part.truth(view) for view in facts.views or (facts,) * self.cameras)
 
     def loss(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> Tensor:
@@ -106,10 +106,10 @@ class Rig(tasks.Joined):
         place = {"any": 0, "all": wrong.shape[1] - 1, "vote": wrong.shape[1] // 2}[self.rule]
         return wrong.sort(dim=1).values[:, place]
 
-    def predictions(self, output: Sequence[tasks.Outputs], count: int = 1) -> list[tuple[Prediction, ...]]:
+    def predictions(self, output: Sequence[tasks.Outputs], count: int = 1) -> list[tuple[tasks.Prediction, ...]]:
         return [(tasks.all_said(self.part.predictions(picture)[0][0] for picture in each),) for each in output]
 
-    def judge(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> list[Judgement]:
+    def judge(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> list[tasks.Judgement]:
         with torch.no_grad():
             margins, scores = (0.0 - self.loss(output, truth)).tolist(), self.score(output, truth).tolist()
         judgements = []
@@ -125,7 +125,9 @@ class Rig(tasks.Joined):
             deciding = min(
                 each, key=lambda judged: judged.margin if self.rule == "mean" else abs(judged.margin - margin)
             )
-            judgements.append(Judgement.of(score, margin, prediction, {"pictures": kept, **tasks.outcome_in(deciding)}))
+            judgements.append(
+                tasks.Judgement.of(score, margin, prediction, {"pictures": kept, **tasks.outcome_in(deciding)})
+            )
         return judgements
 
     def marks(self, output: Sequence[tasks.Outputs], truth: tasks.Truths) -> list[list[tasks.Mark]]:

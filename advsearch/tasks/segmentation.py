@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.extend import Facts, Prediction, tasks
+from advsearch.extend import tasks
 
 EXPECTED = "expected logits (N, classes, height, width), or a mapping with these under 'out' or 'logits'"
 
@@ -71,7 +71,7 @@ class Segmentation(tasks.ClassTask):
     def classes_in(self, output: Tensor) -> int:
         return output.shape[1]
 
-    def truth(self, facts: Facts) -> Region:
+    def truth(self, facts: tasks.Facts) -> Region:
         return Region(self.right_classes(facts), facts.mask)
 
     def truth_names(self, truth: Region) -> tuple[str, ...]:
@@ -114,7 +114,7 @@ class Segmentation(tasks.ClassTask):
         chosen = output.permute(0, 2, 3, 1)[:, mask]
         return chosen.reshape(-1, output.shape[1]) if chosen.shape[1] else None
 
-    def predictions(self, output: Tensor, count: int = 1) -> list[tuple[Prediction, ...]]:
+    def predictions(self, output: Tensor, count: int = 1) -> list[tuple[tasks.Prediction, ...]]:
         """Return the things that most pixels of each picture are given, with the shares that they have."""
         found = []
         for one in output.detach():
@@ -123,8 +123,8 @@ class Segmentation(tasks.ClassTask):
             counts[list(self.nothing)] = 0
             shares, indices = counts.topk(min(count, len(one)))
             rows = zip(indices.tolist(), shares.tolist(), strict=True)
-            listed = tuple(Prediction(self.name_of(i), i, n / one[0].numel()) for i, n in rows if n)
-            found.append(listed or (Prediction("nothing" if len(said) else tasks.NOT_A_NUMBER),))
+            listed = tuple(tasks.Prediction(self.name_of(i), i, n / one[0].numel()) for i, n in rows if n)
+            found.append(listed or (tasks.Prediction("nothing" if len(said) else tasks.NOT_A_NUMBER),))
         return found
 
     def said(self, output: Tensor, truth: Region, margins: Sequence[float]) -> list[tasks.Said]:
@@ -137,19 +137,19 @@ class Segmentation(tasks.ClassTask):
         for logits, margin in zip(output, margins, strict=True):
             pixels = self._pixels(logits[None], truth)
             if pixels is None:
-                found.append((Prediction(tasks.OUT_OF_VIEW), None))
+                found.append((tasks.Prediction(tasks.OUT_OF_VIEW), None))
                 continue
             right, hits = margin >= 0.0, self._correct(logits, truth)
             counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
             first = int(counts.masked_fill(tasks.members(pixels, truth.labels) != right, -1).argmax())
             accuracy, overlap = float(hits[mask].float().mean()), float((hits & mask).sum() / (hits | mask).sum())
-            said = Prediction(self.name_of(first), first, accuracy)
+            said = tasks.Prediction(self.name_of(first), first, accuracy)
             outcome = tasks.Outcome.FOUND if right else tasks.Outcome.WRONG_CLASS
             if not right and first in self.nothing:
                 name = self.name_of(truth.labels[0])
                 is_partly_right = accuracy >= LEAST_ACCURACY
                 outcome = tasks.Outcome.LOOSE if is_partly_right else tasks.Outcome.MISSED
-                said = Prediction(f"{name} in part" if is_partly_right else f"{tasks.NO}{name}", None, accuracy)
+                said = tasks.Prediction(f"{name} in part" if is_partly_right else f"{tasks.NO}{name}", None, accuracy)
             shares = {self.name_of(i): round(n / len(pixels), 4) for i, n in enumerate(counts.tolist()) if n}
             numbers = {"accuracy": round(accuracy, 4), "iou": round(overlap, 4)}
             found.append((said, {tasks.OUTCOME: outcome.value, **numbers, "pixels": shares}))

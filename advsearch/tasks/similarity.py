@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from advsearch.extend import Facts, InputError, Judgement, Model, models, stored_files, tasks
+from advsearch.extend import InputError, Model, models, stored_files, tasks
 
 MOST = 10_000  # pictures of a gallery, before `scaled`
 SIDE = 1024  # longest side in pixels of a picture as it is kept; larger ones are averaged down
@@ -230,7 +230,7 @@ class Similarity(tasks.Classification):
     def _names(self, model: Model) -> tuple[tuple[str, ...], bool]:
         return tuple(name for name, _ in folders_of(self.references)) if self.references else (ITSELF, ELSE), True
 
-    def right_classes(self, facts: Facts) -> tasks.Labels:
+    def right_classes(self, facts: tasks.Facts) -> tasks.Labels:
         """See `ClassTask.right_classes`; with a threshold the clean picture says what is right."""
         if self.references:
             return super().right_classes(facts)
@@ -274,7 +274,7 @@ class Similarity(tasks.Classification):
     def as_logits(self, output: Tensor, truth: tasks.Labels) -> Tensor:
         return super().as_logits(self.logits(output), truth)
 
-    def judge(self, output: Tensor, truth: tasks.Labels) -> list[Judgement]:
+    def judge(self, output: Tensor, truth: tasks.Labels) -> list[tasks.Judgement]:
         """See `Task.judge`; the payload has the cosine to the clean picture, or what `_ranked` says."""
         with torch.no_grad():
             judged, features = super().judge(output, truth), functional.normalize(output, dim=1)

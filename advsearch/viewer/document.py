@@ -18,7 +18,7 @@ from urllib.parse import quote
 from advsearch import __version__
 from advsearch.files import MESHES
 from advsearch.report import wording
-from advsearch.report.shown import Html, element, join_html
+from advsearch.report.views import Html, element, join_html
 from advsearch.runs.directory import PARTS, REPORT
 from advsearch.trust import pages
 

@@ -6,9 +6,9 @@ it.
 
 from __future__ import annotations
 
-from advsearch.report.shown import Html as Html
-from advsearch.report.shown import element as element
-from advsearch.report.shown import join_html as join_html
+from advsearch.report.views import Html as Html
+from advsearch.report.views import element as element
+from advsearch.report.views import join_html as join_html
 from advsearch.trust.pages import Refused as Refused
 from advsearch.viewer.clients import LARGEST_SENT as LARGEST_SENT
 from advsearch.viewer.clients import NO_QR as NO_QR

@@ -15,8 +15,8 @@ from typing import TypeVar
 
 from advsearch import registry
 from advsearch.errors import FileFormatError
-from advsearch.report import shown as showing
-from advsearch.report.shown import Html, Picture, ResultPart, ShownResult, element, join_html
+from advsearch.report import views
+from advsearch.report.views import Html, Picture, ResultPart, ShownResult, element, join_html
 from advsearch.runs.directory import CONFIG, IMAGES, OBJECT_FILE, REPORT, RunDirectory
 from advsearch.runs.files import smaller_png
 from advsearch.runs.results import Result
@@ -49,7 +49,7 @@ def part_html(run: Path, one: ResultPart, said: str) -> Html:
         words = " ".join([f"{one.title}.", *(one.text or [said])])
         chart = element(
             "div",
-            *(showing.study_chart(one.draw, words, width, one.height) for width in (showing.WIDE, showing.NARROW)),
+            *(views.study_chart(one.draw, words, width, one.height) for width in (views.WIDE, views.NARROW)),
         )
     table = None
     if one.heads:
@@ -96,7 +96,7 @@ def _figure(run: Path, name: str, alt: str) -> Html | None:
 def end_html(run: Path, result: Result, given: ShownResult) -> Html:
     """Return what stands at the end of a page: how the result came about, the commands that go on with what was stopped
     and that ask the same again, and all settings."""
-    facts = {name[:1].upper() + name[1:]: text for name, text in showing.facts_of(result, given).items()}
+    facts = {name[:1].upper() + name[1:]: text for name, text in views.facts_of(result, given).items()}
     recipe = run / CONFIG
     parts = [element("h2", "Cost and conditions"), document.facts_table(facts)]
     if result.goes_on:
@@ -163,7 +163,7 @@ def page_of(run: Path, result: Result) -> str:
     results of the run are damaged."""
     make_page = registry.get_experiment(result.command).page
     made: str | None = make_page(run, result) if make_page else None
-    return made or shown_page(run, result, showing.shown(result))
+    return made or shown_page(run, result, views.shown(result))
 
 
 def keep_result(run: RunDirectory, result: AnyResult) -> AnyResult:
@@ -195,9 +195,9 @@ def shown_page(
         lines = [element("li", element("a", name, href=link) if link else name) for name, link in linked]
         inside.append(element("details", element("summary", f"The runs ({len(parts)})"), element("ul", *lines)))
     main = element("main", *inside, end_html(run, result, given))
-    subject = showing.subject_of(result, given)
+    subject = views.subject_of(result, given)
     what = join_html(result.command, "; " if subject else None, document.subject_html(*(("", one) for one in subject)))
-    header = document.heading(what, given.said, showing.remarks_of(result, given))
+    header = document.heading(what, given.said, views.remarks_of(result, given))
     footer = f"run {run.name}. This page needs no other file."
     title = f"{run.name}, {result.command}"
     return document.document(title, header, main, data=data, scripts=scripts, footer=footer)

@@ -31,7 +31,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.questions.sweep.page import SweepSource, result_of, sweep_page_html
 from advsearch.report import wording
-from advsearch.report.shown import Html, element, join_html
+from advsearch.report.views import Html, element, join_html
 from advsearch.runs import directory, listing, store
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, check_links, is_run
 from advsearch.runs.results import plain

@@ -38,7 +38,7 @@ from advsearch.questions.report.recorded import RecordedSettings
 from advsearch.questions.report.result import Evidence, evidence_page, markdown
 from advsearch.questions.sweep.settings import SweepConfig
 from advsearch.questions.test.settings import SuiteConfig
-from advsearch.report.shown import ENDED, NO_PROOF, NOTHING, Claim
+from advsearch.report.views import ENDED, NO_PROOF, NOTHING, Claim
 from advsearch.runs.results import Result
 from advsearch.runs.summary import bundled_digests, to_json
 from advsearch.scene.settings import SETTINGS

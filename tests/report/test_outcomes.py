@@ -19,7 +19,7 @@ from advsearch.questions.harden.result import HardenResult
 from advsearch.questions.sweep.page import sweep_verdict
 from advsearch.questions.sweep.result import OUTCOMES, Predictions, SweptAxis
 from advsearch.questions.test.result import FAILED, search_verdict, share_reason, tried_reason
-from advsearch.report.shown import shown
+from advsearch.report.views import shown
 from advsearch.report.wording import wanted
 from advsearch.rules import count_wrong_outcomes
 from advsearch.runs.store import Row

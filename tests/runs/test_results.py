@@ -14,7 +14,7 @@ from samples import attack
 from advsearch.cli.output import shown_text as check_text
 from advsearch.questions.attack.page import page as attack_page
 from advsearch.questions.attack.summary import AttackSummary
-from advsearch.report.shown import facts_of, fields_shown
+from advsearch.report.views import facts_of, fields_shown
 from advsearch.runs.results import Fields, Interval, JsonFloat, Result, as_fact
 
 

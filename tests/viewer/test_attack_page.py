@@ -29,7 +29,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
 from advsearch.questions.attack import wording
 from advsearch.report.figures import search_axes
-from advsearch.report.shown import NARROW, WIDE, Html, element, join_html, study_chart
+from advsearch.report.views import NARROW, WIDE, Html, element, join_html, study_chart
 from advsearch.report.wording import interval_text, objective_label, percent, seconds_text
 from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.files import read_png

@@ -19,7 +19,7 @@ from samples import CURVE, sweep
 from advsearch.questions.attack.summary import CurveResult
 from advsearch.questions.sweep.display import sweep_axes
 from advsearch.report.figures import search_axes
-from advsearch.report.shown import side_by_side
+from advsearch.report.views import side_by_side
 
 NOTEBOOK, LOSSES = ROOT / "docs" / "notebook.ipynb", ROOT / "docs" / "own-loss.ipynb"
 

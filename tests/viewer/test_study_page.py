@@ -15,7 +15,7 @@ from advsearch.cli.main import main
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.recipe.result import RecipeResult
 from advsearch.questions.stability.result import StabilityResult
-from advsearch.report.shown import fields_shown
+from advsearch.report.views import fields_shown
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results import Result, StudyResult
 from advsearch.viewer.document import heading

@@ -7,8 +7,8 @@ from dataclasses import is_dataclass
 from typing import Any
 
 from advsearch.attacks.candidates import Failures, FoundFailure, failure_share, most_different
-from advsearch.attacks.domain import centre_of_option, half_widths, wraps
-from advsearch.attacks.evaluation import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.domain import Domain, centre_of_option, half_widths, wraps
+from advsearch.attacks.evaluation import Evaluated, Evaluation, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.attacks.policies.auto import Auto, Portfolio, Restarts, WithoutAscent
 from advsearch.attacks.policies.choices import Choices
 from advsearch.attacks.policies.evolution import CMAES, NES
@@ -78,7 +78,9 @@ __all__ = [
     "Adam",
     "Auto",
     "Choices",
+    "Domain",
     "Evaluated",
+    "Evaluation",
     "Failures",
     "FoundFailure",
     "Grid",

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.extend import Domain, InputError, Policy, Proposal, UnknownNameError, policies, seeds
+from advsearch.extend import InputError, Policy, errors, policies, seeds
 
 MOST = 10_000  # more numbers are refused: every cell keeps a whole configuration
 MOST_CELLS = 1_000_000  # an archive has no more
@@ -36,7 +36,7 @@ class ArchiveState:
     archive of ribs, which is never written to again, this generation's configurations (n, d), objectives and successes
     of the first of them, and what the surrogate is made from; None where there are too many numbers, or a norm ball."""
 
-    domain: Domain
+    domain: policies.Domain
     seed: int
     spanned: Tensor
     half: Tensor
@@ -141,7 +141,7 @@ class MapElites(Policy[ArchiveState]):
         if self.population < 2:
             raise InputError(f"population: expected at least 2, got {self.population}")
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> ArchiveState:
+    def start(self, domain: policies.Domain, generator: torch.Generator, steps: int) -> ArchiveState:
         if domain.dim > MOST:
             raise InputError(f"policy 'archive': expected at most {MOST} numbers, got {domain.dim}; use pgd or auto")
         seed, spanned = policies.draw_seed(generator), self._spanned(domain)
@@ -164,8 +164,8 @@ class MapElites(Policy[ArchiveState]):
             domain, seed, spanned, policies.half_widths(domain), archive, 0, torch.cat(first), seen=seen
         )
 
-    def propose(self, state: ArchiveState, n: int) -> tuple[tuple[Proposal, ...], ArchiveState]:
-        return tuple(Proposal(u) for u in state.points[len(state.values) :][:n]), state
+    def propose(self, state: ArchiveState, n: int) -> tuple[tuple[policies.Proposal, ...], ArchiveState]:
+        return tuple(policies.Proposal(u) for u in state.points[len(state.values) :][:n]), state
 
     def update(self, state: ArchiveState, evaluated: policies.Evaluated) -> ArchiveState:
         values = (*state.values, *(evaluation.objective for _, evaluation in evaluated))
@@ -210,7 +210,7 @@ class MapElites(Policy[ArchiveState]):
             points = state.likeliest(surrogate, candidates, self.population - anew)
         return replace(state, points=torch.cat([samples[:anew], points]), seen=seen)
 
-    def _spanned(self, domain: Domain) -> Tensor:
+    def _spanned(self, domain: policies.Domain) -> Tensor:
         """Return (k,) positions of the parameters of these names; of the first two without names."""
         names = [name.strip() for name in self.over.split(",") if name.strip()]
         if not names:
@@ -218,7 +218,7 @@ class MapElites(Policy[ArchiveState]):
         places = {name: place for place, name in enumerate(domain.names)}
         for name in names:
             if name not in places:
-                raise UnknownNameError("parameter in `over` of policy 'archive':", name, places)
+                raise errors.UnknownNameError("parameter in `over` of policy 'archive':", name, places)
         if len(set(names)) != len(names) or len(names) > MOST_SPANNED:
             raise InputError(f"over: expected 1 to {MOST_SPANNED} different parameters, got {', '.join(names)}")
         return torch.tensor([places[name] for name in names])

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.extend import Domain, InputError, Policy, Proposal, policies
+from advsearch.extend import InputError, Policy, policies
 
 MOST = 50  # more numbers are refused: there would never be enough draws to learn from
 WINDOW = 1000
@@ -105,7 +105,7 @@ class MixtureState:
     draws (n, d) and the latest `WINDOW` that were evaluated (m, d), in shares of each range, and of all draws
     objective, failed, unknown, weight and largest weight; see `failure_share`."""
 
-    domain: Domain
+    domain: policies.Domain
     seed: int
     ranges: Ranges
     generation: int
@@ -175,7 +175,7 @@ class Mixture(Policy[MixtureState]):
         if self.population < 2:
             raise InputError(f"population: expected at least 2, got {self.population}")
 
-    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> MixtureState:
+    def start(self, domain: policies.Domain, generator: torch.Generator, steps: int) -> MixtureState:
         if domain.dim > MOST:
             raise InputError(f"policy 'mixture': expected at most {MOST} numbers, got {domain.dim}; use pgd or auto")
         ranges, nothing = (
@@ -186,8 +186,8 @@ class Mixture(Policy[MixtureState]):
         state = MixtureState(domain, policies.draw_seed(generator), ranges, 0, (), nothing, nothing, log)
         return self._drawn(state, None)
 
-    def propose(self, state: MixtureState, n: int) -> tuple[tuple[Proposal, ...], MixtureState]:
-        return tuple(Proposal(state.configuration(x)) for x in state.points[state.told :][:n]), state
+    def propose(self, state: MixtureState, n: int) -> tuple[tuple[policies.Proposal, ...], MixtureState]:
+        return tuple(policies.Proposal(state.configuration(x)) for x in state.points[state.told :][:n]), state
 
     def update(self, state: MixtureState, evaluated: policies.Evaluated) -> MixtureState:
         points, current = state.points[state.told :][: len(evaluated)], state.learnt[-1]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.extend import Exported, Exporter, InputError, Progress, Store, find_run, thumbnails, writing
+from advsearch.extend import Exported, Exporter, InputError, Progress, Store, directory, exports, writing
 
 DETAILS, CLASSES, IMAGES = "details.log", "class_maps.json", "images"
 PLACED = ("environment", "object")  # values that have a place of their own in a line
@@ -72,9 +72,9 @@ class ThreeDB(Exporter):
     options = ("kind",)
 
     def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
-        directory = find_run(run)
-        kept = thumbnails.kept_pictures(directory)
-        with Store(directory / Store.FILE, read_only=True) as store:
+        run_path = directory.find_run(run)
+        kept = exports.thumbnails.kept_pictures(run_path)
+        with Store(run_path / Store.FILE, read_only=True) as store:
             picture = kept.png_of if kept else lambda _: None
             count = write_threedb(lambda: store.rows(options["kind"] or "sweep"), out, picture)
         return Exported({"rows": count}, f"{count} rows in {out}; look at them with: python -m threedboard {out}")

@@ -35,7 +35,6 @@ from advsearch.controls.path.pose_files import (
 from advsearch.extend import (
     Choice,
     Control,
-    FileFormatError,
     Fixed,
     InputError,
     OneOf,
@@ -44,6 +43,7 @@ from advsearch.extend import (
     SceneDescription,
     Value,
     Values,
+    errors,
     geometry,
     parts,
     stored_files,
@@ -216,7 +216,7 @@ class PathControl(Control):
         if trajectory is None:
             return read_waypoints(path, mover, text=text, alone=alone)
         if mover != CAMERA:
-            raise FileFormatError(
+            raise errors.FileFormatError(
                 f"{path}: {trajectory.format.value} is about the camera, and here the object moves; write its way as "
                 "time,x,y,z,heading"
             )
@@ -250,7 +250,7 @@ class PathControl(Control):
             assumed["object_at"] = "[0, 0, 0]"
         positions, rotations = trajectory.orient(axes, up, origin)
         if np.abs(positions).max() > FARTHEST:
-            raise FileFormatError(
+            raise errors.FileFormatError(
                 f"{path}: expected positions within {FARTHEST:g} of the object, got larger ones; object_at says where "
                 "that is in the file's world"
             )
@@ -472,9 +472,9 @@ def align_quaternions(quaternions: parts.Doubles) -> parts.Doubles:
 def check_times(path: Path, times: parts.Doubles) -> None:
     """Raise FileFormatError: times (n,) from the first on are too few or many, or do not ascend within limits."""
     if not 2 <= len(times) <= MOST_WAYPOINTS:
-        raise FileFormatError(f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(times)}")
+        raise errors.FileFormatError(f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(times)}")
     if not (np.isfinite(times).all() and (np.diff(times) >= SHORTEST * (1.0 - ROUNDED)).all() and times[-1] <= LONGEST):
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{path}: expected times that ascend, by {SHORTEST:g} s at least and {LONGEST:g} s in all, got others"
         )
 
@@ -520,7 +520,7 @@ def _read_text(path: Path) -> str:
     try:
         return stored_files.read_text(path, "a table of waypoints", MOST_BYTES).removeprefix("\ufeff")
     except OSError as error:
-        raise FileFormatError(f"{path}: expected a table of waypoints, got {error.strerror}") from error
+        raise errors.FileFormatError(f"{path}: expected a table of waypoints, got {error.strerror}") from error
 
 
 def read_waypoints(path: Path, mover: str, *, text: str, alone: bool = True) -> dict[str, Waypoints]:
@@ -534,25 +534,27 @@ def read_waypoints(path: Path, mover: str, *, text: str, alone: bool = True) -> 
     try:
         header, *rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines()) if any(row)] or [[]]
     except csv.Error as error:
-        raise FileFormatError(f"{path}: expected a table of waypoints, got one with a {error}") from error
+        raise errors.FileFormatError(f"{path}: expected a table of waypoints, got one with a {error}") from error
     columns, parts = (TIME, *PLACE), [0 < len({*group} & {*header}) < len(group) for group in (LOOKING, SHIFT)]
     missing, twice = set(columns) - set(header), len(set(header)) < len(header)
     if missing or twice or set(header) - {*columns, *further} or any(parts):
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{path}: expected columns {', '.join(columns)}, and perhaps {', '.join(further)}, got "
             f"{', '.join(header)[:200] or 'nothing'}; or a trajectory of TUM, EuRoC or KITTI"
         )
     if not 2 <= len(rows) <= MOST_WAYPOINTS:
-        raise FileFormatError(f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(rows)}")
+        raise errors.FileFormatError(f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(rows)}")
     try:
         table = np.array([[float(one) for one in row] for row in rows], np.float64).reshape(len(rows), len(header))
     except ValueError as error:
-        raise FileFormatError(f"{path}: expected {len(header)} numbers in each row, got something else") from error
+        raise errors.FileFormatError(
+            f"{path}: expected {len(header)} numbers in each row, got something else"
+        ) from error
     times = table[:, header.index(TIME)] - table[0, header.index(TIME)]
     check_times(path, times)
     column = {name: table[:, place] for place, name in enumerate(header) if name != TIME}
     if not all(np.abs(one).max() <= FARTHEST for one in column.values()):
-        raise FileFormatError(f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none")
+        raise errors.FileFormatError(f"{path}: expected numbers within {FARTHEST:g}, got larger ones, or none")
 
     notes = dict[str, tuple[str, ...]]()
     for heading in [name for name in (HEADING, TURNING) if name in column]:

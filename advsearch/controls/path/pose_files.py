@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from advsearch.extend import FileFormatError, parts, reading
+from advsearch.extend import errors, parts, reading
 
 MAX_COLUMNS = 64
 MAX_ROWS = 100_000
@@ -114,11 +114,11 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     if is_own or (not headers and "," in lines[first] and leading):
         return None  # a table with a head of another kind
     if len(rows) > MAX_ROWS:
-        raise FileFormatError(f"{path}: expected 2 to {MAX_ROWS} waypoints, got {len(rows)}")
+        raise errors.FileFormatError(f"{path}: expected 2 to {MAX_ROWS} waypoints, got {len(rows)}")
     if headers:
         return _read_named_columns(path, headers[-1], rows, "," in lines[first])
     if "," in lines[first]:
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{path}: expected a first line that names the columns, got numbers; add time,x,y,z, or that of EuRoC's "
             "files: #timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
         )
@@ -128,7 +128,7 @@ def read_trajectory(path: Path, text: str) -> Trajectory | None:
     if count == 12:
         return _read_kitti(path, rows)
     known = " (KITTI-360's first column is a number of a picture; leave it out)" if count in (13, 17) else ""
-    raise FileFormatError(
+    raise errors.FileFormatError(
         f"{path}: expected 8 numbers a line as TUM's timestamp tx ty tz qx qy qz qw, or 12 as KITTI's poses, got "
         f"{count}{known}"
     )
@@ -171,10 +171,12 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
 def _read_table(path: Path, rows: Sequence[Sequence[str]], count: int) -> parts.Doubles:
     for row in rows:
         if len(row) != count or not all(map(reading.is_number, row)):
-            raise FileFormatError(f"{path}: expected {count} numbers in each row, got {reading.shown(' '.join(row))}")
+            raise errors.FileFormatError(
+                f"{path}: expected {count} numbers in each row, got {reading.shown(' '.join(row))}"
+            )
     table = np.array(rows, dtype=object).astype(np.float64)
     if not np.isfinite(table).all():
-        raise FileFormatError(f"{path}: expected finite numbers, got others")
+        raise errors.FileFormatError(f"{path}: expected finite numbers, got others")
     return np.asarray(table, np.float64)
 
 
@@ -190,7 +192,7 @@ def _read_named_columns(
     stated = UNIT.search(names[columns["time"]])
     unit = stated[1].strip() if stated else "s"
     if unit not in UNITS:
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{path}: expected times in {', '.join(UNITS)}, got {reading.shown(unit)}; correct the first line"
         )
     if not stated:
@@ -208,7 +210,7 @@ def _read_named_columns(
         off = np.abs(lengths - 1.0)
         if off.max() > QUATERNION_TOLERANCE:
             worst = int(off.argmax())
-            raise FileFormatError(
+            raise errors.FileFormatError(
                 f"{path}: pose {worst + 1}: expected a quaternion of length 1, got one of {lengths[worst]:.3g}"
             )
         rotations = Rotation.from_quat(quaternions)
@@ -222,7 +224,7 @@ def _read_kitti(path: Path, rows: Sequence[Sequence[str]]) -> Trajectory:
     off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     off = np.where(np.linalg.det(turns) > 0.0, off, np.inf)
     if off.max() > ROTATION_TOLERANCE:
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{path}: pose {int(off.argmax()) + 1}: expected a rotation and a shift (3 rows of 4), got another map"
         )
     return Trajectory(PoseFormat.KITTI, None, poses[:, :, 3], Rotation.from_matrix(turns), ())

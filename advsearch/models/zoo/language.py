@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from advsearch.extend import InputError, ModelError, models
+from advsearch.extend import InputError, errors, models
 from advsearch.models.zoo.library import Loaded, Processing, measured, nearly
 from advsearch.models.zoo.zero_shot import spoken
 
@@ -45,9 +45,9 @@ def source(loaded: Loaded) -> models.Source:
         raise _another(loaded, "reads from an encoder of its own")
     try:
         processor = loaded.part("AutoProcessor")
-    except ModelError as error:
+    except errors.ModelError as error:
         if importlib.util.find_spec("torchvision") is None:
-            raise ModelError(
+            raise errors.ModelError(
                 f"model {loaded.spec}: its processor cannot be loaded, and most of such networks need torchvision for "
                 "that, which is not installed: pip install 'advsearch[torchvision]'"
             ) from error
@@ -123,13 +123,13 @@ class _Speaker(nn.Module):
         side = getattr(getattr(loaded.network.config, "vision_config", None), "image_size", None) or models.SIDE
         self.side = (int(side[0]), int(side[1])) if isinstance(side, (list, tuple)) else (int(side), int(side))
         self.described = Processing()
-        with suppress(ModelError):  # it is called then
+        with suppress(errors.ModelError):  # it is called then
             self.described = measured(lambda **given: processor(text=[self.text], **given), loaded.spec)
         self.affine = "mean" in self.described
         if self.affine:
             self.side = self.described.get("input_size", self.side)
         elif importlib.util.find_spec("torchvision") is None:
-            raise ModelError(
+            raise errors.ModelError(
                 f"model {loaded.spec}: its processor cuts pictures into patches or tiles, and lets gradients through "
                 "with torchvision only, which is not installed: pip install 'advsearch[torchvision]'"
             )
@@ -149,7 +149,7 @@ class _Speaker(nn.Module):
         pixels = self._pixels(image)
         off = float((pixels - expected).abs().max()) if pixels.shape == expected.shape else float("inf")
         if not off <= LEVELS * float(expected.abs().max()):
-            raise ModelError(
+            raise errors.ModelError(
                 f"model {spec}: its processor {type(self.processor).__name__} does something else to numbers than to "
                 "8-bit pictures. Wrap network and processing in an nn.Module of yours, and give that from Python"
             )
@@ -303,8 +303,8 @@ def _check(loaded: Loaded, module: _Named) -> None:
         raise _another(loaded, f"goes on otherwise after what it has kept ({ours:.6g} for {own:.6g})")
 
 
-def _another(loaded: Loaded, what: str) -> ModelError:
-    return ModelError(
+def _another(loaded: Loaded, what: str) -> errors.ModelError:
+    return errors.ModelError(
         f"model {loaded.spec}: is a {type(loaded.network).__name__}, which {what}; expected one that goes on with the "
         "text it is given, such as LlavaForConditionalGeneration or Qwen2_5_VLForConditionalGeneration"
     )

@@ -20,7 +20,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from advsearch.extend import ModelError, models
+from advsearch.extend import errors, models
 
 
 @contextlib.contextmanager
@@ -34,7 +34,7 @@ def reading(spec: str, advice: str) -> Iterator[None]:
         with models.without_unpickling(), warnings.catch_warnings(), models.connecting(models.may_fetch(spec), tries):
             warnings.simplefilter("ignore")
             yield
-    except ModelError:
+    except errors.ModelError:
         raise
     except Exception as error:  # a library raises nearly anything for what is not there or damaged
         if tries:
@@ -42,7 +42,7 @@ def reading(spec: str, advice: str) -> Iterator[None]:
                 f"a file names the model {spec}, which is not on this machine and would be fetched; "
                 f"{models.how_to_allow(spec)}"
             ) from error
-        raise ModelError(
+        raise errors.ModelError(
             f"model {spec}: cannot be fetched or read ({models.first_line(error)}). Weights come from the library's "
             f"cache on this machine, else from where it publishes them; they are never unpickled. {advice}"
         ) from error
@@ -160,8 +160,8 @@ def _triple(numbers: Array) -> models.Triple:
     return red, green, blue
 
 
-def _other(spec: str, processor: Any, what: str) -> ModelError:
-    return ModelError(
+def _other(spec: str, processor: Any, what: str) -> errors.ModelError:
+    return errors.ModelError(
         f"model {spec}: its processor {type(processor).__name__} {what}, which no size, mean and std stand for. Wrap "
         "network and processing in an nn.Module of yours, and give that from Python or as package.module:callable"
     )

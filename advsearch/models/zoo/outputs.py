@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from advsearch.extend import InputError, ModelError, UnknownNameError, models
+from advsearch.extend import InputError, errors, models
 from advsearch.models.zoo import zero_shot
 from advsearch.models.zoo.library import Adapted, Loaded, reading
 
@@ -36,10 +36,10 @@ def gives_features(architecture: str, network: Any) -> bool:
     return getattr(network, "main_input_name", None) == "pixel_values" and not finds
 
 
-def no_classes(name: str, what: str) -> ModelError:
+def no_classes(name: str, what: str) -> errors.ModelError:
     """Return the error for a model that is asked for classes and has features only; `what` it is: "is a
     Dinov2Model"."""
-    return ModelError(
+    return errors.ModelError(
         f"model {name}: {what}, which returns features and has no classes: use `task={TASK}`, which compares "
         "them with those of other pictures, or give a network with a head"
     )
@@ -62,7 +62,7 @@ def source(loaded: Loaded, plain: Callable[[Loaded], models.Source] | None = Non
     elif "ForImageClassification" in type(network).__name__:
         part = network.base_model if network.base_model is not network else getattr(network, "vision_model", None)
         if part is None:
-            raise ModelError(f"model {loaded.spec}: has no part before its head; give its network without one")
+            raise errors.ModelError(f"model {loaded.spec}: has no part before its head; give its network without one")
     token = any(word in name for name, _ in part.named_parameters() for word in TOKENS)
 
     def features(network: Any, images: Tensor) -> Any:
@@ -156,7 +156,7 @@ def load_timm(spec: str, purpose: models.Purpose) -> models.Source:
     name, weights = models.split_weights(spec.partition(":")[2])
     timm = models.library("timm", spec, "timm")
     if not timm.is_model(name.partition(".")[0]):
-        raise UnknownNameError("timm network", name, models.near_names(name, timm.list_models()))
+        raise errors.UnknownNameError("timm network", name, models.near_names(name, timm.list_models()))
     with reading(spec, f"Give 'timm:{name}@weights.safetensors'"):
         module = timm.create_model(name, pretrained=weights is None)
     if weights is not None:
@@ -242,8 +242,10 @@ def load_torchvision(spec: str) -> models.Source:
         for part, what in NOT_FOR_PICTURES.items():
             if name in (zoo.list_models(module=getattr(zoo, part)) if hasattr(zoo, part) else ()):
                 plain = f"torchvision:{name.removeprefix('quantized_')}"
-                raise ModelError(f"model {spec}: {what.format(plain=plain)}")
-        raise UnknownNameError("torchvision network", name, models.near_names(name, (*classifies, *segments, *finds)))
+                raise errors.ModelError(f"model {spec}: {what.format(plain=plain)}")
+        raise errors.UnknownNameError(
+            "torchvision network", name, models.near_names(name, (*classifies, *segments, *finds))
+        )
     default = getattr(zoo.get_model_weights(name), "DEFAULT", None)
     parts = {} if name in classifies else {"weights_backbone": None}
     with reading(spec, f"Give 'torchvision:{name}@weights.safetensors'"):

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from advsearch.extend import ModelError, models
+from advsearch.extend import errors, models
 from advsearch.models.zoo import language, outputs, zero_shot
 from advsearch.models.zoo.library import Adapted, Ask, Loaded, cached_file, in_pixels, processor_of, reading
 
@@ -53,9 +53,11 @@ def load(spec: str, purpose: models.Purpose) -> models.Source:
     if Path(name).is_dir():
         name = str(Path(name).resolve())
     elif Path(name).is_file():
-        raise ModelError(f"model {spec}: is a file; give the folder in which it is with its config.json")
+        raise errors.ModelError(f"model {spec}: is a file; give the folder in which it is with its config.json")
     elif name.startswith((".", "/", "~")) or name.count("/") > 1:
-        raise ModelError(f"model {spec}: no such folder{_near_folders(name)}; a repository is written hf:OWNER/NAME")
+        raise errors.ModelError(
+            f"model {spec}: no such folder{_near_folders(name)}; a repository is written hf:OWNER/NAME"
+        )
     if not sys.stderr.isatty():
         transformers.utils.logging.disable_progress_bar()
     where: dict[str, Any] = {"revision": revision} if revision else {}
@@ -90,7 +92,7 @@ def of_network(network: nn.Module, purpose: models.Purpose) -> models.Source | N
     kind, origin = _kind(spec, network, spec), str(getattr(network, "name_or_path", "") or "")
     where, processor = {"local_files_only": True}, None
     if origin:
-        with suppress(ModelError), reading(spec, ""):  # it may not be there any more
+        with suppress(errors.ModelError), reading(spec, ""):  # it may not be there any more
             processor = processor_of(transformers, origin, where)
     part = partial(_part, transformers, spec, origin, where)
     return kind.source(Loaded(network, spec, spec, processor, part, purpose))
@@ -108,7 +110,7 @@ def _kind(architecture: str, network: Any, spec: str) -> Family:
         ours = kind.ours
         if re.search(ours, architecture) if isinstance(ours, str) else ours(architecture, network):
             return kind
-    raise ModelError(
+    raise errors.ModelError(
         f"model {spec}: is a {architecture}; expected one whose name has ForImageClassification, "
         "ForVideoClassification, ForSemanticSegmentation, ForUniversalSegmentation, ForObjectDetection or "
         "ForDepthEstimation in it, one that compares pictures with texts, as CLIPModel, one that goes on in words, as "
@@ -121,7 +123,7 @@ def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -
     has = partial(cached_file, transformers, name, where=where)
     try:
         if not has("config.json") and has("open_clip_config.json"):
-            raise ModelError(
+            raise errors.ModelError(
                 f"model {spec}: is a repository of open_clip, which transformers can't read; give the network as "
                 "transformers has it, such as hf:openai/clip-vit-base-patch32 or hf:google/siglip-base-patch16-224"
             )
@@ -132,7 +134,7 @@ def _config(transformers: Any, name: str, spec: str, where: Mapping[str, Any]) -
             raise
         cache = Path(import_module("huggingface_hub").constants.HF_HUB_CACHE)
         cached = [folder.name.partition("--")[2].replace("--", "/") for folder in cache.glob("models--*")]
-        raise ModelError(
+        raise errors.ModelError(
             f"model {spec}: {name} is no folder here{_near_folders(name)}, and no repository of that name is in the "
             f"cache{_meant(models.resembling(name, cached))} or can be had ({models.first_line(error)}). Check the "
             "name and the network, or give a folder"
@@ -169,7 +171,7 @@ def _check_whole(network: Any, report: Any, spec: str) -> None:
         network.pooler = None
     elif lacking:
         shown = ", ".join(map(str, lacking[:3])) + (", ..." if len(lacking) > 3 else "")
-        raise ModelError(
+        raise errors.ModelError(
             f"model {spec}: its files lack {len(lacking)} of the network's weights ({shown}), which would be random. "
             "Give a repository that was trained for this, not one of its beginnings"
         )
@@ -256,7 +258,7 @@ def check_fits(transformers: Any, name: str, where: Mapping[str, Any], spec: str
     elif weights := cached_file(transformers, name, "model.safetensors", where):
         size = Path(weights).stat().st_size
     if size > free:
-        raise ModelError(
+        raise errors.ModelError(
             f"model {spec}: its weights take {size / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are free. Give a "
             "smaller network, one whose weights are stored in bfloat16, or a machine with more memory"
         )

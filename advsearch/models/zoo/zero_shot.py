@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from advsearch.extend import InputError, ModelError, models
+from advsearch.extend import InputError, errors, models
 from advsearch.models.zoo.library import Adapted, Ask, Loaded, in_pixels, nearly
 
 TEXTS = 64  # texts that are embedded at once
@@ -56,7 +56,7 @@ def source(loaded: Loaded) -> models.Source:
 def check_takes_pictures(network: Any, spec: str) -> None:
     """Raise a ModelError for a network that takes patches in place of pictures; `spec` is for the message."""
     if "spatial_shapes" in inspect.signature(network.get_image_features).parameters:
-        raise ModelError(
+        raise errors.ModelError(
             f"model {spec}: takes patches of pictures of any size (NaFlex), which are no picture; give a "
             "checkpoint of a fixed resolution, such as hf:google/siglip2-base-patch16-224"
         )
@@ -124,7 +124,7 @@ def _check(network: Any, compared: _Compared, tokenizer: Any, text: str, made: m
     row = scale * averaged(network, tokenizer, [text], ["{}"])
     ours = compared.seen(noise) @ row.T + compared.head.bias[0]
     if own.shape != ours.shape or not nearly(own, ours, max(float(scale), float(own.abs().max())), network.dtype):
-        raise ModelError(
+        raise errors.ModelError(
             f"model {made.name}: is a {type(network).__name__}, whose scores are no scaled cosine of a picture and a "
             "text; expected one such as CLIPModel or SiglipModel"
         )

@@ -17,10 +17,10 @@ from advsearch.questions.attack.summary import (
     MatrixResult,
     ObjectRow,
 )
-from advsearch.report import shown as saying
+from advsearch.report import views
 from advsearch.report import wording as words
 from advsearch.report.figures import BLUE
-from advsearch.report.shown import Claim, Column, ResultPart, ShownResult
+from advsearch.report.views import Claim, Column, ResultPart, ShownResult
 from advsearch.runs.results import ControlGroup, VerifiedRate
 
 AttackResults = AttackSummary | CurveResult | MatrixResult
@@ -40,23 +40,23 @@ def claims(result: AttackResults) -> Iterator[Claim]:
         for row in result.table:
             for cell in row.tested:
                 at_home = cell.model == row.attacked
-                spent = saying.searches_text(row.renders, result.policy, False) if at_home else None
+                spent = views.searches_text(row.renders, result.policy, False) if at_home else None
                 name = f"searched on {row.attacked}, tried on {cell.model}"
-                yield saying.case_claim(name, cell.ending, cell.verified, spent)
+                yield views.case_claim(name, cell.ending, cell.verified, spent)
     else:
         rate, verdict = result.verified, wording.attack_verdict(result)
-        extent = saying.extent_of("fresh renders that count as a success", rate)
+        extent = views.extent_of("fresh renders that count as a success", rate)
         if result.ending == "found" and rate is not None and rate.successes:
             text = f"{verdict} How many such configurations there are is not known."
-            yield saying.claim("found", text, extent)
-        elif result.ending in saying.ENDED and rate is not None:
-            spent = saying.searches_text(result.renders, result.policy, result.baseline is not None)
-            yield saying.claim("not found", f"{verdict} Searched were {spent}. {saying.NO_PROOF}", extent)
+            yield views.claim("found", text, extent)
+        elif result.ending in views.ENDED and rate is not None:
+            spent = views.searches_text(result.renders, result.policy, result.baseline is not None)
+            yield views.claim("not found", f"{verdict} Searched were {spent}. {views.NO_PROOF}", extent)
         else:
             unknown = f"the search ended as {result.ending!r} without trials that carry a claim"
-            yield saying.nothing_claimed(saying.WHY.get(result.ending, unknown), verdict)
+            yield views.nothing_claimed(views.WHY.get(result.ending, unknown), verdict)
         if result.average is not None:
-            yield saying.average_claim(result.average, wording.budget_text(result))
+            yield views.average_claim(result.average, wording.budget_text(result))
 
 
 def _shown_attack(summary: AttackSummary) -> ShownResult:
@@ -255,21 +255,21 @@ def _claims_of_curve(result: CurveResult) -> Iterator[Claim]:
     total: Counter[str] = Counter()
     for row in result.table:
         total.update(row.renders or {})
-    searched = saying.searches_text(total, result.policy, bool(total["baseline"]))
+    searched = views.searches_text(total, result.policy, bool(total["baseline"]))
     spent = f"Searched were, of all objects and epsilons together, {searched}. "
     for point in result.curve:
         if point.accuracy is None:
             continue
-        extent = saying.counted("objects without a failure", point.robust, point.objects, point.interval)
+        extent = views.counted("objects without a failure", point.robust, point.objects, point.interval)
         where = "the controls' own budget" if point.epsilon is None else f"epsilon {point.epsilon:g}"
         text = (
-            f"Within {where} the policy {result.policy} found no failure of {saying.share_text(extent)} objects; "
-            f"{point.already_wrong} are wrong as they are. {spent if total else ''}{saying.NO_PROOF}"
+            f"Within {where} the policy {result.policy} found no failure of {views.share_text(extent)} objects; "
+            f"{point.already_wrong} are wrong as they are. {spent if total else ''}{views.NO_PROOF}"
         )
-        yield saying.claim("measured", text, extent)
+        yield views.claim("measured", text, extent)
     for row in result.table:
         if row.average is not None:
-            yield saying.average_claim(row.average, row.object)
+            yield views.average_claim(row.average, row.object)
 
 
 # ---- attacked on against tested on ----------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from advsearch.questions.attack import display, wording
 from advsearch.questions.attack.summary import AttackSummary
 from advsearch.report import wording as words
 from advsearch.report.figures import search_axes
-from advsearch.report.shown import Column, Picture, ResultPart
+from advsearch.report.views import Column, Picture, ResultPart
 from advsearch.report.wording import count, number_text
 from advsearch.runs import directory, files, store
 from advsearch.runs.results import GroupDerivative, PlannedGradient, Result

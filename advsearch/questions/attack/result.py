@@ -28,7 +28,7 @@ from advsearch.engine.rendering import Rendering, render
 from advsearch.errors import InputError
 from advsearch.questions.attack.summary import AlongDrive, AttackSummary
 from advsearch.report.figures import marked, new_axes, search_axes
-from advsearch.report.shown import result_html, shown, side_by_side
+from advsearch.report.views import result_html, shown, side_by_side
 from advsearch.runs import files, store
 from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.scene.assembly import posed

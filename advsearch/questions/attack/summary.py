@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.report.shown import InNotebook
+from advsearch.report.views import InNotebook
 from advsearch.runs.results import (
     AverageCase,
     CleanScene,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from advsearch.extend import RunContext, experiment, fail_check
+from advsearch.extend import RunContext, errors, experiment
 from advsearch.questions.check.result import CheckConfig, CheckResult, shown
 
 
@@ -14,7 +14,7 @@ from advsearch.questions.check.result import CheckConfig, CheckResult, shown
     "resume gradients",
     positional_args=("object", "model"),
     help_suffix=". Exit status 3 if a gradient is biased or noisy",
-    exit_status=fail_check(lambda result: bool(result.falls_short)),
+    exit_status=lambda result: errors.FELL_SHORT if result.falls_short else 0,
     view=shown,
 )
 def check(context: RunContext[CheckConfig]) -> CheckResult:

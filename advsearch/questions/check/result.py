@@ -8,11 +8,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from advsearch.extend import (
-    Clash,
-    Column,
     DerivativeConfig,
-    Fields,
-    InNotebook,
     ResultPart,
     RunResult,
     SceneConfig,
@@ -20,6 +16,8 @@ from advsearch.extend import (
     results,
     setting,
     setting_as_in,
+    settings,
+    views,
 )
 
 OF_ALL: Mapping[str, object] = {"object": "mug", "environment": None, "controls": {"texture": {}}, "set_": {}}
@@ -33,11 +31,11 @@ class CheckConfig(DerivativeConfig):
     free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "seconds")
 
     # fmt: off
-    clashes: ClassVar[tuple[Clash, ...]] = (
+    clashes: ClassVar[tuple[settings.Clash, ...]] = (
         *DerivativeConfig.clashes,
-        Clash("all", lambda config: any(getattr(config, name) != value for name, value in OF_ALL.items()),
+        settings.Clash("all", lambda config: any(getattr(config, name) != value for name, value in OF_ALL.items()),
               "takes scenes and controls of its own; leave `object`, `environment`, `controls` and `set` out"),
-        Clash("objective", lambda config: config.loss == "linear",
+        settings.Clash("objective", lambda config: config.loss == "linear",
               "is of the model's loss, which `loss=linear` leaves out; leave one of the two out"),
     )
 
@@ -75,7 +73,7 @@ class CheckedRow(results.Measured):
     loss: str = Field(description="`linear`, or `model`: the model's own")
 
 
-class GainRow(Fields):
+class GainRow(results.Fields):
     """What leaving one thing out saves, and the proof that it changes nothing."""
 
     item: str
@@ -87,7 +85,7 @@ class GainRow(Fields):
     seconds: float = Field(description="of a gradient with it")
 
 
-class TexelRow(Fields):
+class TexelRow(results.Fields):
     """How many texels of a searched texture a pixel shows."""
 
     control: str = Field(description="whose texture")
@@ -103,7 +101,7 @@ class SearchPlan(results.PlannedGradient):
     left_out: list[str] = Field(description="what is not computed at all, in sentences")
 
 
-class CheckResult(InNotebook, RunResult):
+class CheckResult(views.InNotebook, RunResult):
     """Every derivative of a scene beside differences, and the plan of a search over it, as far as they are measured."""
 
     command: ClassVar[str] = "check"
@@ -134,7 +132,7 @@ READING = (
     "the converged gradient means that a gradient points the right way."
 )
 
-SINGLE: Mapping[str, Column] = {
+SINGLE: Mapping[str, views.Column] = {
     "object": "{0.object}",
     "parameter": "{0.name}",
     "estimator": "{0.estimator}",
@@ -146,7 +144,7 @@ SINGLE: Mapping[str, Column] = {
     "seconds": "{0.seconds:.2f}",
     "status": "{0.status}",
 }
-WHOLE: Mapping[str, Column] = {
+WHOLE: Mapping[str, views.Column] = {
     "object": "{0.object}",
     "control": "{0.control}",
     "estimator": "{0.estimator}",
@@ -166,13 +164,13 @@ def _step(group: results.GroupDerivative) -> str:
     return f"{group.step:.3g}" + ("" if group.step_in_unit is None else f" ({group.step_in_unit:.3g}{unit})")
 
 
-GROUPS: Mapping[str, Column] = {
+GROUPS: Mapping[str, views.Column] = {
     "parameter": "{0.name}",
     "numbers": "{0.size}",
     "estimator": "{0.estimator}",
     "step": _step,
 }
-GAINS: Mapping[str, Column] = {
+GAINS: Mapping[str, views.Column] = {
     "left out": "{0.what}",
     "a gradient with it takes": "x {0.time_gain:.2f}",
     "picture differs": lambda row: _difference(row.picture_difference),

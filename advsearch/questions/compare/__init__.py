@@ -15,8 +15,8 @@ from advsearch.extend import (
     RunDirectory,
     SceneConfig,
     SweepConfig,
+    directory,
     experiment,
-    find_run,
     results,
     setting,
     setting_as_in,
@@ -126,7 +126,7 @@ def compare(context: RunContext[CompareConfig]) -> CompareResult:
             sides = read_sides([RunDirectory.locate_part(context.run.path, "sweep")])
     else:
         progress.stage("reading rows")
-        sides = read_sides([find_run(name) for name in settings.split_names(config.compared)])
+        sides = read_sides([directory.find_run(name) for name in settings.split_names(config.compared)])
     if not sides:
         context.ending = results.INTERRUPTED
     differ = find_different_settings(sides) if sides else []

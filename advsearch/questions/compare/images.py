@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from advsearch.extend import InputError, ModelError, RunContext
+from advsearch.extend import InputError, RunContext, errors
 from advsearch.questions.compare.result import PairPicture
 from advsearch.questions.compare.sides import Side
 
@@ -87,7 +87,7 @@ class PairImages:
             return
         try:
             scenes = sweep.scenes
-        except (InputError, ModelError) as error:  # a scene or a model is no longer available
+        except (InputError, errors.ModelError) as error:  # a scene or a model is no longer available
             self._unavailable.add(str(sweep.folder))
             self.warnings.append(f"Pictures of {sweep.folder.name} are not shown: {error}")
             return

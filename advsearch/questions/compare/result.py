@@ -9,19 +9,7 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
-from advsearch.extend import (
-    Claim,
-    Column,
-    Fields,
-    InNotebook,
-    Interval,
-    Picture,
-    ResultPart,
-    RunResult,
-    ShownResult,
-    results,
-    wording,
-)
+from advsearch.extend import ResultPart, RunResult, ShownResult, results, views, wording
 
 
 class ComparedSide(results.CountedPredictions):
@@ -37,12 +25,12 @@ class ComparedSide(results.CountedPredictions):
     )
 
 
-class CountOf(Fields):
+class CountOf(results.Fields):
     """How many of some pairs."""
 
     count: int
     total: int = Field(alias="of", description="pairs")
-    interval: Interval = Field(description="of the share, 95 %")
+    interval: results.Interval = Field(description="of the share, 95 %")
     share: float | None = Field(
         default=None,
         description="of all; where pairs share draws, the mean over draws of the share of each; absent of older runs",
@@ -54,7 +42,7 @@ class CountOf(Fields):
         return wording.share_of_text(self.count, self.total, self.interval, self.share)
 
 
-class PairCounts(Fields):
+class PairCounts(results.Fields):
     """Pairs by what both sides say of them."""
 
     both: int = Field(description="pairs that both get right")
@@ -67,7 +55,7 @@ class PairCounts(Fields):
         "of each; absent of older runs",
     )
     difference: float = Field(description="accuracy of the second less that of the first")
-    interval: Interval = Field(description="of that difference, 95 %, of pairs")
+    interval: results.Interval = Field(description="of that difference, 95 %, of pairs")
 
     @property
     def pairs(self) -> int:
@@ -99,7 +87,7 @@ class PairPart(PairCounts):
     value: results.AxisValue
 
 
-class PairPicture(Fields):
+class PairPicture(results.Fields):
     """A pair that one side alone gets right."""
 
     number: int = Field(description="of the pair, from 0")
@@ -130,7 +118,7 @@ class ComparedPair(PairCounts):
     shown: list[PairPicture] = Field(description="pairs that one side alone gets right, the farthest apart first")
 
 
-class CompareResult(InNotebook, RunResult):
+class CompareResult(views.InNotebook, RunResult):
     """Two sides or more on the same pictures; of more than two, each with the first."""
 
     command: ClassVar[str] = "compare"
@@ -168,7 +156,7 @@ MAX_PICTURES = 3  # of what one side alone gets right, likewise
 
 def shown(result: CompareResult) -> ShownResult:
     """Return what is shown of a comparison."""
-    columns: dict[str, Column] = {
+    columns: dict[str, views.Column] = {
         "": "{0.name}",
         "right in": "{0.correct} of {0.configurations}",
         "accuracy": lambda side: wording.percent(side.accuracy),
@@ -205,7 +193,7 @@ def headline(pair: ComparedPair) -> str:
     )
 
 
-def points_text(interval: Interval) -> str:
+def points_text(interval: results.Interval) -> str:
     """Return an interval of a difference in percentage points: ``-3.1 to +4.0``."""
     return " to ".join(f"{100.0 * bound:+.1f}" for bound in interval)
 
@@ -287,7 +275,7 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
     title = f"Only {name} gets right:"
     lines: list[list[str]] = []
     without_pictures: list[str] = []
-    groups: list[list[Picture]] = []
+    groups: list[list[views.Picture]] = []
     for example in pair.shown:
         if example.right != name:
             continue
@@ -305,14 +293,14 @@ def _pictures_of(name: str, pair: ComparedPair) -> Iterator[ResultPart]:
         if len(example.pictures) != 2:
             captions = ["; ".join(captions)]
         captions[0] += f"; {values}"
-        groups.append([Picture(file, caption) for file, caption in zip(example.pictures, captions, strict=True)])
+        groups.append([views.Picture(file, caption) for file, caption in zip(example.pictures, captions, strict=True)])
     if groups and all(len(group) == 1 for group in groups):
         groups = [[picture for group in groups for picture in group]]
     yield ResultPart(title, rows=lines[:MAX_PICTURES], only="text")
     yield ResultPart(title, without_pictures, pictures=groups, only="page")
 
 
-def claims(result: CompareResult) -> Iterator[Claim]:
+def claims(result: CompareResult) -> Iterator[views.Claim]:
     """Yield a claim for each pair."""
     for pair in result.pairs:
         method = "Newcombe's, of pairs" if pair.units is None else f"over {pair.unit}s"
@@ -323,4 +311,4 @@ def claims(result: CompareResult) -> Iterator[Claim]:
             statement += f" Of the others {pair.second} has {outcomes}."
         what = f"configurations in which {pair.second} is right"
         extent = results.Extent.from_count(what, side.correct, side.configurations, side.interval, side.accuracy)
-        yield Claim(kind="measured", statement=statement, extent=extent)
+        yield views.Claim(kind="measured", statement=statement, extent=extent)

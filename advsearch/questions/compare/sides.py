@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from advsearch.extend import FileFormatError, InputError, rules, wording, workbench
+from advsearch.extend import InputError, errors, rules, wording, workbench
 
 DRAW_SETTINGS = ("grid", "controls", "samples", "sampler", "seed")  # decide what is drawn
 SIDE_COLUMNS = ("object", "model", "answer")  # what may tell sides apart, as rows have it
@@ -101,13 +101,13 @@ def read_sides_of(folder: Path, *, is_only: bool) -> Iterator[Side]:
     sweep = workbench.StoredSweep.read(folder)
     summary = sweep.summary
     if summary.goes_on or summary.looked_at != summary.planned:
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{folder}: expected a sweep that has ended, got one with {summary.looked_at} of {summary.planned} "
             f"predictions; go on with it: advsearch resume {folder}"
         )
     rows = sweep.read_rows()
     if len(rows) != summary.planned or not rows["step"].is_unique:
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{folder}: expected {summary.planned} rows, as its summary says, got {len(rows)}; sweep again"
         )
     models = sweep.config.models

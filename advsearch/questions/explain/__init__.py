@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import ClassVar
 
 from advsearch.extend import (
-    Clash,
     Config,
     InputError,
     PositionalArgument,
     RunContext,
     RunDirectory,
     SceneConfig,
+    directory,
     experiment,
-    find_run,
     read_result,
     results,
     setting,
@@ -28,7 +27,9 @@ class ExplainConfig(Config):
     """Everything that decides what `explain` does: whose rows it reads, and what it renders to see whether it is so."""
 
     command: ClassVar[str] = "explain"
-    clashes: ClassVar[tuple[Clash, ...]] = tuple(clash for clash in SceneConfig.clashes if clash.setting == "overwrite")
+    clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
+        clash for clash in SceneConfig.clashes if clash.setting == "overwrite"
+    )
 
     # fmt: off
     sweeps: str = setting(
@@ -93,7 +94,9 @@ def explain(context: RunContext[ExplainConfig]) -> ExplainResult:
     config = context.config
     progress = context.progress
     progress.stage("reading rows")
-    folders = [folder for name in settings.split_names(config.sweeps) for folder in find_sweeps(find_run(name))]
+    folders = [
+        folder for name in settings.split_names(config.sweeps) for folder in find_sweeps(directory.find_run(name))
+    ]
     sweeps = [workbench.StoredSweep.read(folder) for folder in folders]
     rows = read_predictions(sweeps)
     rows = rows[rules.is_in_view(rows)].reset_index(drop=True)

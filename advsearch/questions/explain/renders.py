@@ -13,17 +13,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from advsearch.extend import (
-    InputError,
-    ModelError,
-    RunContext,
-    RunDirectory,
-    SweepConfig,
-    results,
-    rules,
-    seeds,
-    workbench,
-)
+from advsearch.extend import InputError, RunContext, RunDirectory, SweepConfig, errors, results, rules, seeds, workbench
 from advsearch.questions.explain.clusters import find_clusters
 from advsearch.questions.explain.findings import count_right
 from advsearch.questions.explain.result import Confirmation, FailureCluster, FailureClusters, NearestRight
@@ -225,7 +215,7 @@ class Renders:
                     self.render_again(self.sweeps[index], rows["step"].tolist())
                     for index, rows in picked.groupby("sweep")
                 ]
-        except (InputError, ModelError) as error:
+        except (InputError, errors.ModelError) as error:
             self.warnings.append(f"No failures were grouped: {error}")
             return None
         if self.context.ending == results.INTERRUPTED:

@@ -7,26 +7,15 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.extend import (
-    Claim,
-    Column,
-    Fields,
-    Interval,
-    Picture,
-    ResultPart,
-    RunResult,
-    ShownResult,
-    results,
-    wording,
-)
+from advsearch.extend import ResultPart, RunResult, ShownResult, results, views, wording
 
 
-class RightOf(Fields):
+class RightOf(results.Fields):
     """In how many of some configurations the model is right."""
 
     right: int = Field(description="right predictions")
     total: int = Field(alias="of", description="how many")
-    interval: Interval = Field(description="of the share, 95 %")
+    interval: results.Interval = Field(description="of the share, 95 %")
     share: float | None = Field(
         default=None,
         description="right ones of all; where rows share draws, the mean over draws of the share of each",
@@ -75,14 +64,14 @@ class RuleNotTold(RightOf):
     rows: int | None = Field(description="of so many rows, with these shares, it would be told; null where of none")
 
 
-class ParameterWeight(Fields):
+class ParameterWeight(results.Fields):
     """What one parameter, or two together, decide of the prediction."""
 
     parameters: list[str]
     share: results.JsonFloat = Field(
         description="of the variance of the predictions, by which of its parts a value lies in"
     )
-    interval: Interval = Field(description="of the share, 95 %")
+    interval: results.Interval = Field(description="of the share, 95 %")
     parts: int = Field(default=0, description="into how many its values were cut, of two all pairs of parts")
 
 
@@ -96,7 +85,7 @@ class EnvelopeRow(RightOf):
     held: bool = Field(description="whether the rows that did not choose the box show it")
 
 
-class NearestRight(Fields):
+class NearestRight(results.Fields):
     """A failure and the nearest configuration that is right and differs in one value."""
 
     values: dict[str, str | float] = Field(description="of the failure")
@@ -109,7 +98,7 @@ class NearestRight(Fields):
     pictures: list[str] = Field(description="files in the run's folder: of the failure, and of the other")
 
 
-class FailureCluster(Fields):
+class FailureCluster(results.Fields):
     """Failures that look alike to the model."""
 
     failures: int = Field(description="how many of those that were rendered again")
@@ -118,7 +107,7 @@ class FailureCluster(Fields):
     picture: str = Field(description="of it: a file in the run's folder")
 
 
-class FailureClusters(Fields):
+class FailureClusters(results.Fields):
     """Failures, grouped by the numbers that the model decides by."""
 
     features: str = Field(description="what these are")
@@ -182,7 +171,7 @@ def shown(result: ExplainResult) -> ShownResult:
             f"the model is right in {result.text}."
         )
     rules = [f"{number}. {rule_text(number, rule)}" for number, rule in enumerate(result.rules, start=1)]
-    weights: Mapping[str, Column] = {
+    weights: Mapping[str, views.Column] = {
         "parameters": lambda one: " with ".join(one.parameters),
         "decides": lambda one: wording.percent(one.share),
         "95 % interval": lambda one: wording.interval_text(one.interval),
@@ -200,7 +189,7 @@ def shown(result: ExplainResult) -> ShownResult:
         wrong, right = (at if isinstance(at, str) else f"{at:.4g}" for at in (pair.wrong_at, pair.right_at))
         text = f"{pair.parameter} {wrong}{unit}: {pair.answered}; at {right}{unit}: {pair.answered_there}."
         captions = f"wrong: {pair.answered}", f"right: {pair.answered_there}"
-        pictures = [Picture(*captioned) for captioned in zip(pair.pictures, captions, strict=False)]
+        pictures = [views.Picture(*captioned) for captioned in zip(pair.pictures, captions, strict=False)]
         sections.append(ResultPart(text=[text], pictures=[pictures]))
     if result.clusters:
         sections.append(_kinds(result.clusters))
@@ -280,11 +269,11 @@ def _kinds(found: FailureClusters) -> ResultPart:
     pictures = []
     for one in found.listed:
         labels = ", ".join(f"{name} {number}" for name, number in [*one.answers.items()][:MOST_PREDICTIONS])
-        pictures.append(Picture(one.picture, f"{one.failures}: {labels}"))
+        pictures.append(views.Picture(one.picture, f"{one.failures}: {labels}"))
     return ResultPart("Kinds of failures", [text], pictures=[pictures])
 
 
-def claims(result: ExplainResult) -> Iterator[Claim]:
+def claims(result: ExplainResult) -> Iterator[views.Claim]:
     """Yield the claims that the rules and the envelope support."""
     for number, rule in enumerate(result.rules, 1):
         counts: RightOf = rule.confirmed or rule
@@ -293,15 +282,15 @@ def claims(result: ExplainResult) -> Iterator[Claim]:
         where = f"{wording.conditions_text(rule.conditions)} (rule {number})"
         inside = f"{wording.share_text(extent)} {source}"
         statement = f"Where {where} the model is right in {inside}; elsewhere in {rule.elsewhere.text}."
-        yield Claim(kind="measured", statement=statement, extent=extent)
+        yield views.Claim(kind="measured", statement=statement, extent=extent)
     box = result.envelope
     if box is not None and box.held and box.total:
         extent = box.extent("right, of rows that did not choose the box")
         where = wording.conditions_text(box.conditions)
         inside = f"{wording.share_text(extent)} configurations that did not choose this box"
         statement = f"Inside {where} the model is right in {inside}; the sweeps drew no others."
-        yield Claim(kind="measured", statement=statement, extent=extent)
+        yield views.Claim(kind="measured", statement=statement, extent=extent)
     elif not result.rules:
         reason = "no box of values was shown to keep the accuracy that was asked for"
         statement = f"Nothing is claimed: {reason}. {envelope_text(result)}"
-        yield Claim(kind="nothing claimed", statement=statement, extent=None)
+        yield views.Claim(kind="nothing claimed", statement=statement, extent=None)

@@ -11,7 +11,7 @@ from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
-from advsearch.extend import InputError, ModelError, RunContext, RunDirectory, results, seeds, statistics, workbench
+from advsearch.extend import InputError, RunContext, RunDirectory, errors, results, seeds, statistics, workbench
 from advsearch.questions.harden import scenes
 from advsearch.questions.harden.detectors import DetectorCourse, Loss, SegmenterCourse, read_coco
 from advsearch.questions.harden.lessons import PICTURES
@@ -70,11 +70,13 @@ def hardened(
     try:
         task = workbench.make_task(config.task)
         (loaded, *_), warnings = workbench.load_models([model or config.model], task, config)
-    except ModelError as error:
+    except errors.ModelError as error:
         if not classifies:
             raise
         text = str(error).partition(": use `task=")[0]
-        raise ModelError(f"{text}; harden trains classifiers, and with `task` detectors and segmenters") from error
+        raise errors.ModelError(
+            f"{text}; harden trains classifiers, and with `task` detectors and segmenters"
+        ) from error
     work = SceneWork(config, loaded, scenes.splits_of(config, loaded), asked.progress)
     student = trainable(loaded, config.layers, logits=classifies)
     given: dict[str, Any] = {"beside": beside} if classifies else {"loss": loss}

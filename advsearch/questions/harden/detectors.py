@@ -19,14 +19,13 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from advsearch.extend import (
-    FileFormatError,
     InputError,
     Model,
-    ModelError,
     Problem,
     RunDirectory,
     Task,
     color,
+    errors,
     seeds,
     stored_files,
     workbench,
@@ -95,7 +94,7 @@ def read_coco(folder: Path, model: Model) -> list[Example]:
             name = Path(str(image["file_name"]))
             file = inside / name
             if name.is_absolute() or ".." in name.parts or file.is_symlink() or inside not in file.resolve().parents:
-                raise FileFormatError(f"{path}: expected names of files in images/, got {str(name)[:100]}")
+                raise errors.FileFormatError(f"{path}: expected names of files in images/, got {str(name)[:100]}")
             picture = torch.from_numpy(workbench.upright(file, LARGEST_SIDE))
             if picture.shape[:2] != (image["height"], image["width"]):
                 raise ValueError(f"{name} of another size than it says")
@@ -106,7 +105,7 @@ def read_coco(folder: Path, model: Model) -> list[Example]:
             examples.append(Example(color.levels_of(picture), boxes, labels))
         return examples
     except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise FileFormatError(f"{path}: expected COCO's JSON beside images/, got {str(error)[:120]}") from None
+        raise errors.FileFormatError(f"{path}: expected COCO's JSON beside images/, got {str(error)[:120]}") from None
 
 
 def own_loss(network: nn.Module, x: Tensor, targets: Sequence[Target]) -> Tensor:
@@ -128,7 +127,7 @@ def own_loss(network: nn.Module, x: Tensor, targets: Sequence[Target]) -> Tensor
     if isinstance(returned, Mapping):
         returned = torch.stack([loss.sum() for loss in returned.values()]).sum()
     if not isinstance(returned, Tensor) or returned.numel() != 1:
-        raise ModelError(
+        raise errors.ModelError(
             "the network returns no loss: its `forward` has to take targets after its input and return a loss or a "
             "mapping of losses; or give `loss`, a function of network, input and targets, in Python"
         )

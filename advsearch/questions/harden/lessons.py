@@ -22,7 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.extend import Domain, Model, Problem, RunDirectory, color, seeds, writing
+from advsearch.extend import Model, Problem, RunDirectory, color, policies, seeds, writing
 
 PICTURES = "artifacts/pictures"  # what was trained on, in the run
 SPP, MATRIX_SPP, DEPTH = 2, 4, 4
@@ -58,7 +58,7 @@ class TextureLesson(Lesson):
     which changes in place."""
 
     space: Any
-    domain: Domain
+    domain: policies.Domain
     linear: Any
     numbers: Tensor
     texture: Tensor
@@ -135,7 +135,7 @@ def lessons(
     return drawn
 
 
-def tried(domain: Domain, generator: torch.Generator, count: int) -> Tensor:
+def tried(domain: policies.Domain, generator: torch.Generator, count: int) -> Tensor:
     """Draw configurations (count, d) at random. In half of them each number is moved to the nearer end of its range by
     chance, as searches end where several numbers are. Choices, and numbers that are periodic, have no ends. Of several
     controls each moves alone in turn, then all of them at once."""

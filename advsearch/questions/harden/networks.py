@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
-from advsearch.extend import Model, ModelError
+from advsearch.extend import Model, errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def trainable(model: Model, layers: str = "all", *, logits: bool = True) -> Trai
         ModelError: the network cannot be trained, has no parameters, or returns something other than logits.
     """
     if logits and (model.probabilities or model.read is not None):
-        raise ModelError(f"model {model.name}: only a classifier that returns logits can be hardened")
+        raise errors.ModelError(f"model {model.name}: only a classifier that returns logits can be hardened")
     net = model.copy_network()
     net.eval().requires_grad_(True)
     if layers == "last":
@@ -84,7 +84,7 @@ def trainable(model: Model, layers: str = "all", *, logits: bool = True) -> Trai
         owners[-1].requires_grad_(True)
     made = Trainable(net, model.with_network(net))
     if not made.parameters():
-        raise ModelError(f"model {model.name}: has no parameters to train")
+        raise errors.ModelError(f"model {model.name}: has no parameters to train")
     return made
 
 

@@ -9,11 +9,6 @@ from pydantic import Field, JsonValue, model_validator
 
 from advsearch.extend import (
     AttackConfig,
-    Claim,
-    Column,
-    Fields,
-    InNotebook,
-    Interval,
     ResultPart,
     RunResult,
     ShownResult,
@@ -21,6 +16,7 @@ from advsearch.extend import (
     results,
     setting,
     setting_as_in,
+    views,
     wording,
 )
 
@@ -120,11 +116,11 @@ class HardenConfig(AttackConfig):
         return self.command, *self.controls
 
 
-class Share(Fields):
+class Share(results.Fields):
     """A share of right predictions."""
 
     accuracy: float = Field(description="`right` of `count`")
-    interval: Interval = Field(description="of that share, 95 %, over scenes of the objects at hand")
+    interval: results.Interval = Field(description="of that share, 95 %, over scenes of the objects at hand")
     right: int
     count: int
     outcomes: results.Outcomes = results.optional(
@@ -132,7 +128,7 @@ class Share(Fields):
     )
 
 
-class HardenedControl(Fields):
+class HardenedControl(results.Fields):
     """Robust accuracy over the held-out scenes against searches over one control."""
 
     control: str
@@ -142,7 +138,7 @@ class HardenedControl(Fields):
     stronger: Share = Field(description="after, against the search `stronger_search`")
 
 
-class TrainingRound(Fields):
+class TrainingRound(results.Fields):
     """One round of search and training, judged on scenes of the training's environments that it was not trained on."""
 
     lessons: int = Field(description="views that it was trained on")
@@ -152,7 +148,7 @@ class TrainingRound(Fields):
     kept: bool = Field(description="whether its weights are the result")
 
 
-class SplitSide(Fields):
+class SplitSide(results.Fields):
     """What one side of the split consists of; no object and, held out, no environment is on two sides."""
 
     objects: list[str]
@@ -161,7 +157,7 @@ class SplitSide(Fields):
     views: int
 
 
-class HardenResult(InNotebook, RunResult):
+class HardenResult(views.InNotebook, RunResult):
     """How robust a model was, and how robust it is after training on worst cases."""
 
     command: ClassVar[str] = "harden"
@@ -216,7 +212,7 @@ TRAINED = (
     "the training's environments on which it was not trained."
 )
 HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interval")
-ROUNDS: Mapping[str, Column] = {
+ROUNDS: Mapping[str, views.Column] = {
     "round": "{0[0]}",
     "views trained on": "{0[1].lessons}",
     "part of the way": lambda row: wording.percent(row[1].part),
@@ -224,7 +220,7 @@ ROUNDS: Mapping[str, Column] = {
     "worst pictures right": lambda row: wording.percent(row[1].robust),
     "kept": lambda row: "yes" if row[1].kept else "",
 }
-SPLIT: Mapping[str, Column] = {
+SPLIT: Mapping[str, views.Column] = {
     "side": "{0[0]}",
     "objects": lambda row: ", ".join(row[1].objects),
     "environments": lambda row: ", ".join(row[1].environments),
@@ -291,7 +287,7 @@ def shown(result: HardenResult) -> ShownResult:
     return ShownResult(said, sections, facts, about=[",".join(result.objects), ", ".join(result.controls)])
 
 
-def claims(result: HardenResult) -> Iterator[Claim]:
+def claims(result: HardenResult) -> Iterator[views.Claim]:
     """Yield the shares of held-out scenes without a failure."""
     for when, share in (("Before", result.before), ("After hardening", result.after)):
         if share is not None:
@@ -301,4 +297,4 @@ def claims(result: HardenResult) -> Iterator[Claim]:
                 f"({wording.percent(share.accuracy)}, 95 % interval {wording.interval_text(share.interval)}) held-out "
                 "scenes. This does not show that there is none."
             )
-            yield Claim.of({"kind": "measured", "statement": text, "extent": extent})
+            yield views.Claim.of({"kind": "measured", "statement": text, "extent": extent})

@@ -21,7 +21,6 @@ from advsearch.extend import (
     Problem,
     Progress,
     assets,
-    library,
     results,
     seeds,
     settings,
@@ -269,7 +268,7 @@ def splits_of(config: HardenConfig, model: Model) -> dict[str, SceneSide]:
             f"held_out: {', '.join(files)} has no other instances; name objects of its class that training never sees"
         )
     lit = [
-        settings.split_names(names) if names else library.list_environments(bundled)
+        settings.split_names(names) if names else workbench.library.list_environments(bundled)
         for names, bundled in ((config.environment, "train"), (config.held_out_environment, "heldout"))
     ]
     sides = {name: (known, lit[0], True) for name in (TRAINING, FURTHER, VALIDATION)}

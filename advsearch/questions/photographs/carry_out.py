@@ -19,21 +19,20 @@ from pydantic import JsonValue
 
 from advsearch.extend import (
     AttackConfig,
-    FileFormatError,
     InputError,
-    Judgement,
     Model,
     RunDirectory,
     Store,
     SweepConfig,
     Task,
     directory,
-    find_run,
+    errors,
     markup,
     seeds,
     settings,
     statistics,
     stored_files,
+    tasks,
     workbench,
     writing,
 )
@@ -57,10 +56,12 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
         FileFormatError: what was kept of a photograph is something else.
     """
     kept, rows = ["rendering", "right", "label", "file"], list[dict[str, object]]()
-    with workbench.in_turn(), Store.open_to_read(find_run(run)) as store:
+    with workbench.in_turn(), Store.open_to_read(directory.find_run(run)) as store:
         for row in store.rows(PHOTO):
             if not {*kept} <= (photo := _photo_of(row)).keys():
-                raise FileFormatError(f"row {row.id}: expected what was kept of a photograph, got something else")
+                raise errors.FileFormatError(
+                    f"row {row.id}: expected what was kept of a photograph, got something else"
+                )
             model = str(row.values["model"]["value"]) if "model" in row.values else ""
             said = {"model": model, "correct": bool(row.correct), "said": row.label or ""}
             rows.append({**photo, "right": bool(photo["right"]), **said})
@@ -197,7 +198,7 @@ class _PhotoJudge:
     size: tuple[int, int]
     truth: Callable[[str | None, str | None], workbench.Truth]
 
-    def judgement(self, rendering: str | None, name: str | None, data: bytes) -> Judgement:
+    def judgement(self, rendering: str | None, name: str | None, data: bytes) -> tasks.Judgement:
         """What is to be said of a picture, made as large as the run's renderings are: in 8 bits, with Lanczos' filter,
         which averages where it shrinks."""
         with Image.open(io.BytesIO(data), formats=("JPEG", "PNG", "WEBP")) as image:

@@ -17,13 +17,13 @@ from pathlib import Path
 from PIL import Image, ImageOps
 from pydantic import Field
 
-from advsearch.extend import Fields, InputError, Interval, directory, markup, wording
+from advsearch.extend import InputError, directory, markup, results, wording
 
 PHOTO, LOOSE_PHOTO = "photo", "loose photo"
 """Kinds of rows in a run's store: photographs that were aligned with a rendering, and ones that were with none."""
 
 
-class PhotographedRendering(Fields):
+class PhotographedRendering(results.Fields):
     """One rendering, what one model says of it, and of the photographs that were aligned with it."""
 
     rendering: str = Field(description="its name: the number of a sweep's picture, or adversarial, clean, ...")
@@ -33,12 +33,12 @@ class PhotographedRendering(Fields):
     photos: int
     photos_right: int = Field(description="photographs in which the model is right")
     agreeing: int = Field(description="photographs that are right where the rendering is, or wrong where it is")
-    interval: Interval = Field(description="95 % Clopper-Pearson interval of the share that agrees")
+    interval: results.Interval = Field(description="95 % Clopper-Pearson interval of the share that agrees")
     labels: list[str] = Field(description="what the model predicts of each photograph, in their order")
     files: list[str] = Field(description="their files in images/photos/, likewise")
 
 
-class PhotoAgreement(Fields):
+class PhotoAgreement(results.Fields):
     """The table of agreement between renderings and reality: counts of photographs, each by each model."""
 
     photos: int
@@ -47,7 +47,7 @@ class PhotoAgreement(Fields):
     wrong_right: int = Field(description="wrong in the rendering, right in the photograph")
     wrong_wrong: int = Field(description="wrong in the rendering, wrong in the photograph")
     agreement: float | None = Field(description="share of the photographs that agree; null where there are none")
-    interval: Interval | None = Field(
+    interval: results.Interval | None = Field(
         description="95 % Clopper-Pearson interval of the agreement, as if all photographs were independent"
     )
     renderings: list[PhotographedRendering]

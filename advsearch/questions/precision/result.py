@@ -9,11 +9,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field, field_validator
 
 from advsearch.extend import (
-    Clash,
-    Column,
     DerivativeConfig,
-    Fields,
-    Interval,
     ResultPart,
     RunResult,
     SceneConfig,
@@ -23,6 +19,7 @@ from advsearch.extend import (
     setting,
     setting_as_in,
     settings,
+    views,
 )
 
 QUANTITIES = ("image", "gradient")
@@ -35,11 +32,11 @@ class PrecisionConfig(DerivativeConfig):
 
     # fmt: off
     command: ClassVar[str] = "precision"
-    clashes: ClassVar[tuple[Clash, ...]] = (
+    clashes: ClassVar[tuple[settings.Clash, ...]] = (
         *DerivativeConfig.clashes,
-        Clash("samplers", lambda config: "image" not in config.measured_quantities,
+        settings.Clash("samplers", lambda config: "image" not in config.measured_quantities,
               "is of the image, which `quantities` leaves out; leave it out too"),
-        Clash("loss", lambda config: "gradient" not in config.measured_quantities,
+        settings.Clash("loss", lambda config: "gradient" not in config.measured_quantities,
               "is of the gradient, which `quantities` leaves out; leave it out too"),
     )
 
@@ -109,14 +106,14 @@ class PrecisionPoint(results.Measured):
         return math.nan if self.error is None else self.error
 
 
-class PrecisionSlope(Fields):
+class PrecisionSlope(results.Fields):
     """A line through the points of one estimator: logarithm of the error against that of the samples."""
 
     quantity: str
     control: str
     estimator: str
     slope: float
-    interval: Interval
+    interval: results.Interval
     offset: float = Field(description="logarithm of the error at one sample")
     points: int
     theory: float | None = Field(description="what the slope should be")
@@ -124,7 +121,7 @@ class PrecisionSlope(Fields):
     agrees: bool | None = Field(description="null where that can't be told")
 
 
-class PrecisionReference(Fields):
+class PrecisionReference(results.Fields):
     """What stands for the truth, and how far off it may be."""
 
     quantity: str
@@ -135,7 +132,7 @@ class PrecisionReference(Fields):
     spp: int = Field(description="samples a pixel of all parts together")
 
 
-class Recommended(Fields):
+class Recommended(results.Fields):
     """The setting that reaches the goal soonest."""
 
     quantity: str
@@ -150,7 +147,7 @@ class Recommended(Fields):
     repeats: int | None = results.optional("measurements that confirm it")
 
 
-class Sitting(Fields):
+class Sitting(results.Fields):
     """What was measured in one sitting: of the picture and the margin, or of the gradient of a control."""
 
     points: list[PrecisionPoint] = Field(default=[])
@@ -161,7 +158,7 @@ class Sitting(Fields):
     took: float = Field(default=0.0, description="seconds by the clock")
 
 
-class Machine(Fields):
+class Machine(results.Fields):
     """What a time has to be read with."""
 
     cpu: str
@@ -206,7 +203,7 @@ def describe_quantity(quantity: str, control: str = "") -> str:
     return f"the gradient of {control}" if quantity == "gradient" else f"the {quantity}"
 
 
-SLOPES: Mapping[str, Column] = {
+SLOPES: Mapping[str, views.Column] = {
     "what": lambda slope: slope.control or slope.quantity,
     "estimator": "{0.estimator}",
     "slope": "{0.slope:.2f}",
@@ -217,7 +214,7 @@ SLOPES: Mapping[str, Column] = {
         slope.agrees
     ],
 }
-REFERENCES: Mapping[str, Column] = {
+REFERENCES: Mapping[str, views.Column] = {
     "what": lambda reference: reference.control or reference.quantity,
     "reference": "{0.reference}",
     "samples": "{0.spp}",
@@ -292,7 +289,7 @@ def list_cautions(points: Sequence[PrecisionPoint]) -> list[str]:
 
 def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> ResultPart:
     rows = [point for point in points if point.quantity == quantity]
-    columns: dict[str, Column] = {"control": "{0.control}"} if quantity == "gradient" else {}
+    columns: dict[str, views.Column] = {"control": "{0.control}"} if quantity == "gradient" else {}
     columns |= {
         "estimator": "{0.estimator}",
         "samples": "{0.spp}",
@@ -305,7 +302,7 @@ def _make_error_table(quantity: str, points: Sequence[PrecisionPoint]) -> Result
     return ResultPart.table(rows, {**columns, "repeats": "{0.repeats}"}, title=quantity.capitalize())
 
 
-def _format_interval(interval: Interval | None) -> str:
+def _format_interval(interval: results.Interval | None) -> str:
     return "" if interval is None else f"{100 * interval[0]:.2g} to {100 * interval[1]:.2g}"
 
 

@@ -14,14 +14,13 @@ from pydantic import ValidationError
 
 from advsearch.extend import (
     AttackConfig,
-    FileFormatError,
     InputError,
     RunContext,
     RunDirectory,
     SceneConfig,
     Store,
     SweepConfig,
-    UnknownNameError,
+    errors,
     figures,
     read_result,
     results,
@@ -157,7 +156,7 @@ def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where:
         place, beside = f"It stands in {where}, figure {number} ({kind})", getattr(options, "beside", None)
         for option, part in [*(("of", part) for part in options.of), *([("beside", beside)] if beside else [])]:
             if part not in (*recipe.parts, PHOTOGRAPHS):
-                raise UnknownNameError("part", part, [*recipe.parts, PHOTOGRAPHS], f"{place}, as `{option}`.")
+                raise errors.UnknownNameError("part", part, [*recipe.parts, PHOTOGRAPHS], f"{place}, as `{option}`.")
         shown = {part: has for part, has in columns.items() if part != beside and part in (options.of or columns)}
         for option in NAMING if shown else ():
             value = getattr(options, option, None) or ()
@@ -166,7 +165,7 @@ def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where:
                 lacking = [part for part, has in shown.items() if column not in known and not names & {*has}]
                 if len(lacking) == len(shown):
                     others = {name for has in shown.values() for name in has if not name.endswith(ANY)}
-                    raise UnknownNameError("column", column, known | others, f"{place}, as `{option}`.")
+                    raise errors.UnknownNameError("column", column, known | others, f"{place}, as `{option}`.")
                 if lacking:
                     raise InputError(f"{place}: {lacking[0]} has no {column}; name the parts that have it as `of`")
 
@@ -261,11 +260,11 @@ def read_options(described: Mapping[str, object], where: str) -> tuple[str, Opti
     """Return the kind of a figure and its options; refuse a kind that there is not, or such an option."""
     kind = str(described.get("figure", ""))
     if kind not in FIGURES:
-        raise UnknownNameError("figure", kind, FIGURES, f"It stands in {where}.")
+        raise errors.UnknownNameError("figure", kind, FIGURES, f"It stands in {where}.")
     try:
         return kind, FIGURES[kind][0](**{name: value for name, value in described.items() if name != "figure"})
     except ValidationError as error:
-        raise FileFormatError(f"{where}: figures: {kind}: {first_of(error)}; see docs/recipes.md") from None
+        raise errors.FileFormatError(f"{where}: figures: {kind}: {first_of(error)}; see docs/recipes.md") from None
 
 
 def make(rows: Rows, kind: str, options: Options) -> Iterator[MadeFigure]:

@@ -12,16 +12,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from advsearch.extend import (
-    AttackConfig,
-    FileFormatError,
-    InputError,
-    SceneConfig,
-    SweepConfig,
-    UnknownNameError,
-    seeds,
-    settings,
-)
+from advsearch.extend import AttackConfig, InputError, SceneConfig, SweepConfig, errors, seeds, settings
 from advsearch.questions.recipe.result import RecipeConfig
 
 CONFIGS: Mapping[str, type[SceneConfig]] = {"attack": AttackConfig, "sweep": SweepConfig}
@@ -104,7 +95,7 @@ class Recipe(_Described):
     def made_quick(self) -> Recipe:
         for name in (*self.quick.parts, *self.quick.without):
             if name not in self.parts:
-                raise UnknownNameError("part", name, self.parts, "It stands under `quick` in the recipe.")
+                raise errors.UnknownNameError("part", name, self.parts, "It stands under `quick` in the recipe.")
         parts = {
             name: part.model_copy(update={"settings": settings.merged(part.settings, self.quick.parts.get(name, {}))})
             for name, part in self.parts.items()
@@ -123,7 +114,9 @@ def titles() -> dict[str, str]:
 
 def recipe_yaml(name: str) -> str:
     if name not in recipe_names():
-        raise UnknownNameError("recipe", name, recipe_names(), "A recipe of your own is a YAML file: give its path.")
+        raise errors.UnknownNameError(
+            "recipe", name, recipe_names(), "A recipe of your own is a YAML file: give its path."
+        )
     return str((BUNDLED / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
@@ -151,9 +144,11 @@ def recipe_of(data: Mapping[str, object], where: str) -> Recipe:
     try:
         return Recipe(**{name: value for name, value in data.items() if name not in ("schema", "command")})
     except ValidationError as error:
-        raise FileFormatError(f"{where}: {first_of(error)}; advsearch show recipe backgrounds prints one") from None
+        raise errors.FileFormatError(
+            f"{where}: {first_of(error)}; advsearch show recipe backgrounds prints one"
+        ) from None
     except (RecursionError, TypeError) as error:
-        raise FileFormatError(f"{where}: expected a recipe, got {type(error).__name__}") from None
+        raise errors.FileFormatError(f"{where}: expected a recipe, got {type(error).__name__}") from None
 
 
 def first_of(error: ValidationError) -> str:
@@ -195,7 +190,7 @@ def planned(recipe: Recipe, config: RecipeConfig) -> list[PlannedRun]:
                 made = kind(**{**part_settings, **own})
             except settings.SettingsError as error:
                 raise settings.SettingsError(error.problems, where) from None
-            except UnknownNameError:
+            except errors.UnknownNameError:
                 raise
             except InputError as error:
                 raise InputError(f"{where}: {error}") from None

@@ -17,7 +17,7 @@ import pandas as pd
 from pandas.api.types import is_numeric_dtype
 from pydantic import BaseModel, ConfigDict, Field
 
-from advsearch.extend import InputError, Interval, RunDirectory, Store, figures, statistics, wording, workbench
+from advsearch.extend import InputError, RunDirectory, Store, figures, results, statistics, wording, workbench
 from advsearch.questions.recipe.description import PHOTOGRAPHS
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -134,10 +134,10 @@ class Tally:
         return [self.times, self.total, self.share, *(self.interval() or (None, None))]
 
     @property
-    def drawn(self) -> tuple[float, Interval] | None:
+    def drawn(self) -> tuple[float, results.Interval] | None:
         return None if self.share is None else (self.share, self.interval() or (0.0, 1.0))
 
-    def interval(self, among: int = 1) -> Interval | None:
+    def interval(self, among: int = 1) -> results.Interval | None:
         """Return the 95 % interval of the share, widened for a choice among so many (Bonferroni)."""
         if not self.total:
             return None

@@ -11,16 +11,16 @@ from pydantic import Field, JsonValue, field_validator
 
 from advsearch.extend import (
     Config,
-    Fields,
-    InNotebook,
     ResultPart,
     RunResult,
     SceneConfig,
     ShownResult,
     SweepConfig,
+    results,
     setting,
     setting_as_in,
     settings,
+    views,
     wording,
 )
 
@@ -125,7 +125,7 @@ class RecipeConfig(Config):
 SHARES = ("share", "low", "high")  # columns of a figure's numbers that are a share and the ends of its 95 % interval
 
 
-class RecipePart(Fields):
+class RecipePart(results.Fields):
     """One run of a recipe."""
 
     name: str = Field(description="of its folder, in `parts`")
@@ -136,7 +136,7 @@ class RecipePart(Fields):
     renders: int = Field(description="pictures that it took")
 
 
-class RecipeFigure(Fields):
+class RecipeFigure(results.Fields):
     """One figure: its numbers, and what they say."""
 
     figure: str = Field(description="its kind")
@@ -146,7 +146,7 @@ class RecipeFigure(Fields):
     rows: list[list[Cell]] = Field(description="of its numbers")
 
 
-class RecipeResult(InNotebook, RunResult):
+class RecipeResult(views.InNotebook, RunResult):
     """What a recipe came to: its runs, its figures and what they say."""
 
     command: ClassVar[str] = "recipe"

@@ -15,9 +15,9 @@ from advsearch.extend import (
     Problem,
     RunContext,
     RunDirectory,
-    UnknownNameError,
+    directory,
+    errors,
     figures,
-    find_run,
     seeds,
     settings,
     workbench,
@@ -62,7 +62,7 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
     stages.begin("setup", workbench.LOADING)
     budget: dict[str, object] = {}
     if config.around is not None:  # its centre has to lie within
-        attack_config = AttackConfig.from_yaml(RunDirectory.locate_config(find_run(config.around)))
+        attack_config = AttackConfig.from_yaml(RunDirectory.locate_config(directory.find_run(config.around)))
         budget = {"epsilon": attack_config.epsilon, "norm": attack_config.norm}
     problem, warnings = workbench.problem_from_config(AttackConfig.of(config, **budget))
     for text in warnings:
@@ -119,7 +119,7 @@ def find_varied(problem: Problem, config: RegionConfig) -> VariedParameters:
     names = tuple(coordinate_of) if config.vary is None else settings.split_names(config.vary)
     for name in names:
         if name not in coordinate_of:
-            raise UnknownNameError("parameter in `vary`", name, coordinate_of)
+            raise errors.UnknownNameError("parameter in `vary`", name, coordinate_of)
     if not 1 <= len(names) <= MAX_PARAMETERS:
         raise InputError(
             f"vary: expected 1 to {MAX_PARAMETERS} parameters, got {len(names)}; "
@@ -136,7 +136,7 @@ def read_centre(problem: Problem, config: RegionConfig) -> Tensor:
     centre: Tensor = problem.domain.start.clone()
     if config.around is None:
         return centre
-    values = torch.from_numpy(workbench.read_configuration(find_run(config.around)))
+    values = torch.from_numpy(workbench.read_configuration(directory.find_run(config.around)))
     if values.shape != centre.shape:
         raise InputError(
             f"`around` {config.around}: expected a run over the same controls, whose configuration has "

@@ -9,17 +9,13 @@ from pydantic import Field
 
 from advsearch.extend import (
     AttackConfig,
-    Claim,
-    Column,
-    Fields,
-    InNotebook,
-    Interval,
     ResultPart,
     SceneConfig,
     ShownResult,
     results,
     setting,
     setting_as_in,
+    views,
     wording,
 )
 
@@ -60,7 +56,7 @@ class RegionConfig(SceneConfig):
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", group="region", description="samples per pixel")
 
 
-class AxisRange(Fields):
+class AxisRange(results.Fields):
     """One parameter and the range of it that is shown."""
 
     name: str
@@ -75,7 +71,7 @@ class BoxSide(AxisRange):
     centre: float = Field(description="the value that the box grew around")
 
 
-class MarginMap(Fields):
+class MarginMap(results.Fields):
     """The margin on a grid over two parameters."""
 
     axes: tuple[AxisRange, AxisRange]
@@ -84,7 +80,7 @@ class MarginMap(Fields):
     )
 
 
-class GrownRegion(Fields):
+class GrownRegion(results.Fields):
     """What is known of a region; nothing yet if it was interrupted."""
 
     verdict: str | None = Field(default=None, description="`right` or `wrong`, at the centre")
@@ -92,7 +88,7 @@ class GrownRegion(Fields):
     same: int | None = Field(default=None, description="fresh samples of the box that had that verdict")
     samples: int | None = Field(default=None, description="all fresh samples of it")
     rate: float | None = Field(default=None, description="the share of those that had it")
-    interval: Interval | None = Field(default=None, description="of that share")
+    interval: results.Interval | None = Field(default=None, description="of that share")
     volume: float | None = Field(default=None, description="share of the ranges that the box takes up")
     spp: int | None = Field(default=None, description="samples a pixel")
     map: MarginMap | None = Field(
@@ -100,7 +96,7 @@ class GrownRegion(Fields):
     )
 
 
-class RegionResult(InNotebook, GrownRegion, results.SceneResult):
+class RegionResult(views.InNotebook, GrownRegion, results.SceneResult):
     """The box around a configuration in which the verdict stays."""
 
     command: ClassVar[str] = "region"
@@ -124,7 +120,7 @@ def shown(result: RegionResult) -> ShownResult:
     """Return what is shown of a region."""
     if result.box is None or result.interval is None:
         return ShownResult("Stopped before the box was known.")
-    box: Mapping[str, Column] = {
+    box: Mapping[str, views.Column] = {
         "parameter": "{0.name}",
         "from": "{0.low:.4g}",
         "to": "{0.high:.4g}",
@@ -139,7 +135,7 @@ def shown(result: RegionResult) -> ShownResult:
     )
 
 
-def claims(result: RegionResult) -> Iterator[Claim]:
+def claims(result: RegionResult) -> Iterator[views.Claim]:
     """Yield the claim about the box, if it is known."""
     if not result.samples or result.same is None or result.interval is None or result.verdict is None:
         return
@@ -152,4 +148,4 @@ def claims(result: RegionResult) -> Iterator[Claim]:
         f"Inside {box} the model is {result.verdict} in {inside}. Certified by sampling: single points of it may "
         "differ."
     )
-    yield Claim(kind="measured", statement=statement, extent=extent)
+    yield views.Claim(kind="measured", statement=statement, extent=extent)

@@ -18,7 +18,7 @@ from advsearch.extend import (
     Progress,
     RunContext,
     RunDirectory,
-    find_run,
+    directory,
     images,
     seeds,
     settings,
@@ -160,7 +160,7 @@ def rendered_again(asked: RunContext[ReplayConfig], parts: workbench.AttackParts
     is of another command."""
     config = asked.config
     asked.progress.stage(workbench.LOADING)
-    folder = find_run(config.attack)
+    folder = directory.find_run(config.attack)
     summary = workbench.attack_of(folder)
     if summary.adversarial is None:
         raise InputError(

@@ -21,7 +21,7 @@ import OpenEXR
 import torch
 from torch import Tensor
 
-from advsearch.extend import FileFormatError, SceneDescription, assets, color, geometry, parts, stored_files, workbench
+from advsearch.extend import SceneDescription, assets, color, errors, geometry, parts, stored_files, workbench
 
 LONGEST = 300  # seconds that one picture may take, the start included, before `scaled`
 MATT = assets.Material(roughness=1.0, metallic=0.0, specular=0.0)  # of the ground
@@ -122,7 +122,7 @@ class Cycles:
     def __init__(self, description: SceneDescription, size: tuple[int, int], *, max_depth: int, denoise: bool) -> None:
         try:
             self._command = workbench.find_blender("Blender's Cycles has to render it", "leave `ways=blender` out")
-        except FileFormatError as error:
+        except errors.FileFormatError as error:
             raise BlenderError(str(error)) from None
         known = (parts.MeshPart, parts.PointLamp, parts.BallLamp)
         unknown = [part.name for part in description.parts if not isinstance(part, known)]

@@ -10,11 +10,7 @@ from pydantic import Field, field_validator
 
 from advsearch.extend import (
     AttackConfig,
-    Claim,
-    Clash,
     Config,
-    Fields,
-    InNotebook,
     ResultPart,
     SceneConfig,
     ShownResult,
@@ -22,6 +18,7 @@ from advsearch.extend import (
     setting,
     setting_as_in,
     settings,
+    views,
     wording,
 )
 
@@ -36,7 +33,9 @@ class ReplayConfig(Config):
     conditions."""
 
     command: ClassVar[str] = "replay"
-    clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
+    clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
+        one for one in SceneConfig.clashes if one.setting == "overwrite"
+    )
 
     attack: str = setting(
         ..., "replay", "the run whose adversarial scene is rendered again", "the name or the folder of a run of attack"
@@ -82,7 +81,7 @@ class ReplayConfig(Config):
 NOT_DONE = "not done"  # How a condition ends that could not be had
 
 
-class ReplayRow(Fields):
+class ReplayRow(results.Fields):
     """One condition, and what is left of the adversarial scene under it."""
 
     way: str = Field(description="what is changed; `as verified` where nothing is")
@@ -99,7 +98,7 @@ class ReplayRow(Fields):
     reason: str = Field("", description="why it was not done, and what to do; absent if it was")
 
 
-class ReplayResult(InNotebook, results.SceneResult):
+class ReplayResult(views.InNotebook, results.SceneResult):
     """The adversarial scene of a run under other conditions than it was searched and verified under."""
 
     command: ClassVar[str] = "replay"
@@ -137,11 +136,11 @@ def shown(result: ReplayResult) -> ShownResult:
     return ShownResult(replay_text(result), [table], {"attack": result.answer, "model": result.model}, about)
 
 
-def claims(result: ReplayResult) -> Iterator[Claim]:
+def claims(result: ReplayResult) -> Iterator[views.Claim]:
     for row in result.table:
         name = f"the adversarial scene of {PurePath(result.answer).name}, {row.way}"
         name += "" if row.way == row.condition else f": {row.condition}"
-        yield Claim.of_case(name, row.ending, row.verified)
+        yield views.Claim.of_case(name, row.ending, row.verified)
 
 
 def replay_text(result: ReplayResult) -> str:

@@ -14,22 +14,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeGuard, cast
 
 from advsearch.extend import (
-    AdvsearchError,
-    Claim,
     InputError,
-    Interval,
     Store,
-    UnknownNameError,
     __version__,
     directory,
-    find_run,
-    get_experiment,
+    errors,
     read_result,
     results,
     settings,
     statistics,
     stored_files,
+    views,
     wording,
+    workbench,
 )
 from advsearch.questions.report.recorded import (
     CLAIM,
@@ -68,16 +65,16 @@ Exposure = Mapping[str, Mapping[str, float]]  # how common the values of axes ar
 
 def is_attack(result: results.Result) -> TypeGuard[workbench.AttackSummary]:
     """Whether a result is that of one attack, and not of a study of several."""
-    return isinstance(result, get_experiment("attack").result)
+    return isinstance(result, workbench.get_experiment("attack").result)
 
 
 def is_sweep(result: results.Result) -> TypeGuard[workbench.SweepSummary]:
     """Whether a result is that of a sweep."""
-    return isinstance(result, get_experiment("sweep").result)
+    return isinstance(result, workbench.get_experiment("sweep").result)
 
 
-def nothing_claimed(why: str) -> Claim:
-    return Claim(kind="nothing claimed", statement=f"Nothing is claimed: {why}.", extent=None)
+def nothing_claimed(why: str) -> views.Claim:
+    return views.Claim(kind="nothing claimed", statement=f"Nothing is claimed: {why}.", extent=None)
 
 
 def conditions_of(result: results.Result, photographs: Sequence[Any] | None = None) -> list[ConditionShare]:
@@ -114,11 +111,11 @@ def _has(value: float | str, of: workbench.AxisValue) -> bool:
 
 
 def triggering_conditions(result: results.Result) -> list[str]:
-    triggering = get_experiment(result.command).triggering
+    triggering = workbench.get_experiment(result.command).triggering
     return [] if triggering is None else list(triggering(result))
 
 
-def met(criterion: float, interval: Interval) -> str:
+def met(criterion: float, interval: results.Interval) -> str:
     """Return whether a share is surely at least as large as asked, surely not, or neither."""
     return "met" if interval[0] >= criterion else "not met" if interval[1] < criterion else "open"
 
@@ -133,7 +130,7 @@ def chosen_axes(result: results.Result) -> list[str]:
 
 
 def criterion_lines(
-    claims: Sequence[Claim], conditions: Sequence[ConditionShare], criterion: float, chosen: Sequence[str] = ()
+    claims: Sequence[views.Claim], conditions: Sequence[ConditionShare], criterion: float, chosen: Sequence[str] = ()
 ) -> list[str]:
     """Return what a criterion, that so large a share is right, comes to. A share of failures has none.
 
@@ -191,7 +188,7 @@ def exposure_lines(result: results.Result, conditions: Sequence[ConditionShare],
             continue
         for value in weights:
             if value not in rows:
-                raise UnknownNameError(f"value of {axis} in the exposure", value, rows)
+                raise errors.UnknownNameError(f"value of {axis} in the exposure", value, rows)
         total = sum(weights.values())
         if not independent:
             lines.append(f"Weighted by {axis}: not told, as predictions share draws (frames of a drive do).")
@@ -290,23 +287,25 @@ RULES = (
 QUICK = "Made by a quick recipe: few and small pictures, to see what comes out; no result."
 
 
-def claims_of(result: results.Result) -> list[Claim]:
+def claims_of(result: results.Result) -> list[views.Claim]:
     if result.goes_on:
         state = "is running" if getattr(result, "ending", "") == results.RUNNING else "is not finished"
         return [nothing_claimed(f"the run {state}" + (f"; so far: {result.brief}" if result.brief else ""))]
-    if claims := get_experiment(result.command).claims:
+    if claims := workbench.get_experiment(result.command).claims:
         return list(claims(result)) or [nothing_claimed("nothing in this run came to its end")]
     return [nothing_claimed(f"the command {result.command} does not measure how often a model is right")]
 
 
-def photo_claims(photos: Any) -> list[Claim]:
+def photo_claims(photos: Any) -> list[views.Claim]:
     """Return the claim of a table of agreement (`advsearch.photo_agreement`); none where it is empty."""
     if not photos.photos or photos.interval is None:
         return []
     agreeing = photos.right_right + photos.wrong_wrong
     extent = results.Extent.from_count("photographs that agree", agreeing, photos.photos, photos.interval)
     text = f"Photographs and renderings agree (both right, or both wrong) in {wording.share_text(extent)}."
-    return [Claim(kind="measured", statement=f"{text} The interval takes photographs as independent.", extent=extent)]
+    return [
+        views.Claim(kind="measured", statement=f"{text} The interval takes photographs as independent.", extent=extent)
+    ]
 
 
 def warnings_over(models: Sequence[str], digests: Sequence[str]) -> list[str]:
@@ -332,7 +331,7 @@ NOT_WEIGHTED = "Nothing is said of how common the conditions are: no weights wer
 def evidence_of(
     name: str,
     result: results.Result,
-    claims: Sequence[Claim],
+    claims: Sequence[views.Claim],
     recorded: Sequence[RecordedSettings],
     made: Mapping[str, str],
 ) -> EvidenceRun:
@@ -378,7 +377,7 @@ def evidence_of(
 def searched_lines(result: results.Result, settings: Mapping[str, object]) -> list[str]:
     lines = []
     if is_attack(result):
-        lines.append(get_experiment(result.command).view(result).facts["changed"])
+        lines.append(workbench.get_experiment(result.command).view(result).facts["changed"])
         lines += [
             f"{name}: {found.low:.4g} to {found.high:.4g} {found.unit}".rstrip()
             for name, found in (result.configuration or {}).items()
@@ -443,10 +442,10 @@ def _measured(
     return {**named, "Pictures": wording.formation_text(formation, gains)} if formation else named
 
 
-def _excluded(result: results.Result, claims: Sequence[Claim]) -> list[str]:
+def _excluded(result: results.Result, claims: Sequence[views.Claim]) -> list[str]:
     lines = ["Nothing varied but what stands under What varied, and the noise of the renders."]
     if is_attack(result):
-        lines += get_experiment(result.command).view(result).cautions
+        lines += workbench.get_experiment(result.command).view(result).cautions
         bad = result.non_finite
         if bad.objectives or bad.gradient_elements:
             lines.append(f"Not finite: {bad.objectives} objectives, {bad.gradient_elements} numbers of gradients.")
@@ -474,7 +473,7 @@ def collected(
     right predictions that is asked for, `exposure` how common the values of axes are, and `by` who answers for it."""
     told, pictures, folders = list[EvidenceRun](), dict[str, bytes](), dict[Path, Path]()
     models, digests = list[str](), list[str]()
-    for folder in map(find_run, runs):
+    for folder in map(directory.find_run, runs):
         parts = [part for part in sorted((folder / directory.PARTS).glob("*")) if directory.is_run(part)]
         of_recipe = parts and own_settings(folder).get("command") == "recipe"  # the runs that it consists of
         folders |= {part.resolve(): part for part in (parts if of_recipe else [folder])}
@@ -517,7 +516,7 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
             settings=RecordedSettings("", settings).as_text(),
             command_line=f"advsearch run {folder / directory.CONFIG}",
         )  # fmt: skip
-    result, photographs, rows = read_result(folder), list[Claim](), list[Any]()
+    result, photographs, rows = read_result(folder), list[views.Claim](), list[Any]()
     if (folder / directory.PHOTOGRAPHS).is_dir():
         from advsearch.extend import workbench  # it brings torch, which takes a second
 
@@ -538,7 +537,7 @@ def _run(folder: Path, criterion: float | None, exposure: Exposure) -> EvidenceR
     few = [QUICK] if outer.get("command") == "recipe" and outer.get("quick") is True else []
     basis = []  # the sweeps whose rows it reads: it is about what varied there
     for path in sweeps:
-        with suppress(AdvsearchError):
+        with suppress(errors.AdvsearchError):
             basis.append((read_result(path), own_settings(path)))
     searched = list(dict.fromkeys(line for one in basis for line in searched_lines(*one)))
     if (noted_parts := noted_settings(folder, result)) is not None:

@@ -10,17 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from advsearch.extend import (
-    AdvsearchError,
-    Config,
-    RunDirectory,
-    directory,
-    find_run,
-    get_experiment,
-    results,
-    settings,
-    wording,
-)
+from advsearch.extend import Config, RunDirectory, directory, errors, results, settings, wording, workbench
 
 CLAIM = "claim"  # the kind of settings that a suite noted for each of its claims
 NOT_SETTINGS = ("schema", "command", "base", *settings.PLACE)
@@ -66,8 +56,8 @@ class RecordedSettings:
 
     @cached_property
     def _kind(self) -> type[Config] | None:
-        with suppress(AdvsearchError, KeyError):
-            config: type[Config] = get_experiment(str(self.values.get("command") or "")).settings
+        with suppress(errors.AdvsearchError, KeyError):
+            config: type[Config] = workbench.get_experiment(str(self.values.get("command") or "")).settings
             return config
         return None
 
@@ -79,7 +69,7 @@ class RecordedSettings:
     @cached_property
     def _idle(self) -> set[str]:
         """The settings that would say nothing if they were given."""
-        with suppress(AdvsearchError):
+        with suppress(errors.AdvsearchError):
             if self._kind is not None:
                 given = {name: value for name, value in self.values.items() if name not in NOT_SETTINGS}
                 config = self._kind(**given)
@@ -106,7 +96,7 @@ def _task_options(named: Any, objective: object) -> dict[str, Any]:
     from advsearch.extend import workbench  # it brings torch, which takes a second
 
     options = dict[str, Any]()
-    with suppress(AdvsearchError):
+    with suppress(errors.AdvsearchError):
         task = workbench.make_task(named)
         task = task.seeking(objective) if isinstance(objective, str) else task
         parts = {f"{part.name}.": part for part in task.parts} if isinstance(task, workbench.Together) else {"": task}
@@ -120,7 +110,7 @@ def _task_options(named: Any, objective: object) -> dict[str, Any]:
 
 def own_settings(folder: Path) -> Mapping[str, Any]:
     """Return what the `run.yaml` of a run says; nothing where it cannot be read."""
-    with suppress(AdvsearchError):
+    with suppress(errors.AdvsearchError):
         return settings.read_yaml(folder / directory.CONFIG)
     return {}
 
@@ -138,8 +128,8 @@ def attacks_read(values: Mapping[str, Any]) -> list[Path]:
 def _found(names: Iterable[object]) -> list[Path]:
     folders = list[Path]()
     for name in dict.fromkeys(name for name in names if isinstance(name, str) and name):
-        with suppress(AdvsearchError, OSError, ValueError):
-            folders.append(find_run(name))
+        with suppress(errors.AdvsearchError, OSError, ValueError):
+            folders.append(directory.find_run(name))
     return folders
 
 
@@ -154,11 +144,11 @@ def recorded_settings(folder: Path, result: results.Result, read: Sequence[Path]
 
 def noted_settings(folder: Path, result: results.Result) -> Mapping[str, Mapping[str, Mapping[str, Any]]] | None:
     """Return what a run noted of settings beside its own, by kind and name; None for an experiment that notes none."""
-    hook = get_experiment(result.command).noted_settings
+    hook = workbench.get_experiment(result.command).noted_settings
     if hook is None:
         return None
     noted: Mapping[str, Mapping[str, Mapping[str, Any]]] = {}
-    with suppress(AdvsearchError):
+    with suppress(errors.AdvsearchError):
         noted = hook(folder, result)
     return noted
 
@@ -175,7 +165,7 @@ def made_with(folder: Path, read: Sequence[Path]) -> dict[str, str]:
     found = dict[str, dict[str, None]]()
     parts = [part for part in sorted((folder / directory.PARTS).glob("*")) if directory.is_run(part)]
     for run in [folder, *parts, *read]:
-        with suppress(AdvsearchError):
+        with suppress(errors.AdvsearchError):
             for name, text in RunDirectory.read_made_with(run).items():
                 found.setdefault(name, {})[str(text)] = None
     return {name: ", then ".join(texts) for name, texts in found.items()}

@@ -8,10 +8,10 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.extend import Claim, Fields, Interval, markup, results, wording
+from advsearch.extend import markup, results, views, wording
 
 
-class ConditionShare(Fields):
+class ConditionShare(results.Fields):
     """In how many configurations under one condition the model is right."""
 
     condition: str = Field(description="in words, with its unit")
@@ -19,16 +19,16 @@ class ConditionShare(Fields):
     value: str
     right: int
     total: int = Field(alias="of", description="configurations")
-    interval: Interval = Field(description="of the share, 95 %")
+    interval: results.Interval = Field(description="of the share, 95 %")
 
 
-class EvidenceRun(Fields):
+class EvidenceRun(results.Fields):
     """One run: what it was about, how it was measured and what it stands for."""
 
     run: str
     command: str
     ending: str
-    claims: list[Claim]
+    claims: list[views.Claim]
     begun: str = Field("", description="when the run was begun, UTC; empty where that is not known")
     criterion: list[str] = Field([], description="what the criterion comes to; absent without one")
     triggering: list[str] = Field([], description="rules under which the model is wrong more often; absent without")

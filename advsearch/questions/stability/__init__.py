@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from advsearch.extend import RunContext, experiment, fail_check
+from advsearch.extend import RunContext, errors, experiment
 from advsearch.questions.stability.result import StabilityConfig, StabilityResult, shown
 
 
@@ -13,7 +13,7 @@ from advsearch.questions.stability.result import StabilityConfig, StabilityResul
     "stability --seconds 120 --run extremes",
     "resume extremes",
     help_suffix=". Exit status 3 if one falls short",
-    exit_status=fail_check(lambda result: any(row.status != "ok" for row in result.rows)),
+    exit_status=lambda result: errors.FELL_SHORT if any(row.status != "ok" for row in result.rows) else 0,
     view=shown,
 )
 def stability(context: RunContext[StabilityConfig]) -> StabilityResult:

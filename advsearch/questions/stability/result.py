@@ -13,11 +13,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field
 
 from advsearch.extend import (
-    Clash,
-    Column,
     Config,
-    Fields,
-    InNotebook,
     InputError,
     ResultPart,
     SceneConfig,
@@ -26,6 +22,7 @@ from advsearch.extend import (
     setting,
     setting_as_in,
     settings,
+    views,
 )
 
 
@@ -34,7 +31,9 @@ class StabilityConfig(Config):
 
     command: ClassVar[str] = "stability"
     free: ClassVar[tuple[str, ...]] = (*Config.free, "seconds")
-    clashes: ClassVar[tuple[Clash, ...]] = tuple(clash for clash in SceneConfig.clashes if clash.setting == "overwrite")
+    clashes: ClassVar[tuple[settings.Clash, ...]] = tuple(
+        clash for clash in SceneConfig.clashes if clash.setting == "overwrite"
+    )
 
     case: str | None = setting(
         None, "check", "cases to try, separated by commas", "names of cases", otherwise="all", repeats=True
@@ -65,7 +64,7 @@ class StabilityConfig(Config):
 OK, FELL_SHORT = "ok", "fell short"
 
 
-class Check(Fields):
+class Check(results.Fields):
     """One number that decides, and the range that it has to be in, both ends included; null where there is no end."""
 
     what: str
@@ -92,7 +91,7 @@ def holds(what: str, truth: bool) -> Check:
     return check(what, float(truth), 1.0, 1.0)
 
 
-class CaseRow(Fields):
+class CaseRow(results.Fields):
     """One case of the suite and what it showed."""
 
     case: str = Field(description="its name")
@@ -110,7 +109,7 @@ class CaseRow(Fields):
     seconds: float = Field(description="what the case took")
 
 
-class StabilityResult(InNotebook, results.Result):
+class StabilityResult(views.InNotebook, results.Result):
     """Extreme cases, and whether each of them holds."""
 
     command: ClassVar[str] = "stability"
@@ -129,7 +128,7 @@ class StabilityResult(InNotebook, results.Result):
         return f"{sum(row.status == OK for row in self.rows)} of {len(self.rows)} hold"
 
 
-COLUMNS: Mapping[str, Column] = {
+COLUMNS: Mapping[str, views.Column] = {
     "group": "{0.group}",
     "case": "{0.case}",
     "status": "{0.status}",

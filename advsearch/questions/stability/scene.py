@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.extend import Domain, Evaluation, Policy, SceneDescription, assets, gradients, results, workbench
+from advsearch.extend import Policy, SceneDescription, assets, gradients, policies, results, workbench
 from advsearch.questions.stability.result import Outcome, check, holds
 
 SIZE = 24  # side of the images in pixels
@@ -211,7 +211,9 @@ def measure_inward_slope(
     return float(gradient @ direction), math.fsum(slopes) / seeds
 
 
-def evaluate(renderer: gradients.Renderer, loss: gradients.Loss, spp: int, query: workbench.Query) -> Evaluation:
+def evaluate(
+    renderer: gradients.Renderer, loss: gradients.Loss, spp: int, query: workbench.Query
+) -> policies.Evaluation:
     """Evaluate a configuration by a loss of the image; over 0 is a success."""
     spp *= query.samples
     non_finite_before, renders_before = renderer.non_finite, renderer.renders
@@ -222,7 +224,7 @@ def evaluate(renderer: gradients.Renderer, loss: gradients.Loss, spp: int, query
         value = loss(render_image(renderer, query.u, query.number, spp))
     objective = float(value)
     cost = (renderer.renders - renders_before) * query.samples
-    return Evaluation(objective, gradient, objective > 0.0, renderer.non_finite - non_finite_before, cost)
+    return policies.Evaluation(objective, gradient, objective > 0.0, renderer.non_finite - non_finite_before, cost)
 
 
 def run_search(
@@ -236,7 +238,7 @@ def run_search(
     return workbench.search(evaluate_all, make_domain(renderer, start), policy, steps=steps, seed=0, **options)
 
 
-def make_domain(renderer: gradients.Renderer, start: Tensor | None = None) -> Domain:
+def make_domain(renderer: gradients.Renderer, start: Tensor | None = None) -> policies.Domain:
     """Return where a search may look, from a configuration or the renderer's start."""
     space: Any = renderer.space  # of controls, since `make_renderer` made it
     start = renderer.start if start is None else start

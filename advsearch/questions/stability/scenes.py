@@ -14,7 +14,7 @@ import OpenEXR
 import torch
 from torch import Tensor
 
-from advsearch.extend import InputError, RunContext, UnknownNameError, assets, geometry, gradients, workbench
+from advsearch.extend import InputError, RunContext, assets, errors, geometry, gradients, workbench
 from advsearch.questions.stability.result import (
     CASES,
     Case,
@@ -400,7 +400,7 @@ def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
         known = dict.fromkeys(getattr(each, kind) for each in CASES)
         for name in wanted:
             if name not in known:
-                raise UnknownNameError("case" if kind == "name" else kind, name, known)
+                raise errors.UnknownNameError("case" if kind == "name" else kind, name, known)
     return [case for case in CASES if not (names or groups) or case.name in names or case.group in groups]
 
 

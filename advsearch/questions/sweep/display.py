@@ -29,7 +29,7 @@ from advsearch.questions.sweep.summary import (
 )
 from advsearch.report import wording
 from advsearch.report.figures import ACCURACY, BLUE, GREY, MARGIN, MOST_POINTS, Figures, axis_title, figure_of, heat
-from advsearch.report.shown import Claim, Column, Extent, ResultPart, ShownResult, claim, counted, extent_of, share_text
+from advsearch.report.views import Claim, Column, Extent, ResultPart, ShownResult, claim, counted, extent_of, share_text
 from advsearch.report.wording import beside_text, count, margin_text, percent, prediction_text, short_name
 from advsearch.runs.results import INTERRUPTED, CountedPredictions
 from advsearch.settings import split_names

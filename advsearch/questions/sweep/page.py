@@ -20,8 +20,8 @@ from advsearch.files import JsonObject, JsonValue
 from advsearch.questions.sweep import display as sweeps
 from advsearch.questions.sweep.summary import SweepSummary
 from advsearch.report import wording
-from advsearch.report.shown import Html, element, join_html
-from advsearch.report.shown import shown as shown_of
+from advsearch.report.views import Html, element, join_html
+from advsearch.report.views import shown as shown_of
 from advsearch.report.wording import beside_text, prediction_text
 from advsearch.runs import directory
 from advsearch.runs.summary import read_result

@@ -23,7 +23,7 @@ from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.page import write_sweep_page
 from advsearch.questions.sweep.summary import AxisRow, MapAxis, PairedRates, SweepMap, SweepSummary
 from advsearch.report.figures import new_axes
-from advsearch.report.shown import result_html, shown
+from advsearch.report.views import result_html, shown
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory, default_name
 from advsearch.runs.export import read_threedb

@@ -11,16 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from advsearch.extend import (
-    AttackConfig,
-    InputError,
-    RunContext,
-    SceneConfig,
-    Store,
-    UnknownNameError,
-    results,
-    workbench,
-)
+from advsearch.extend import AttackConfig, InputError, RunContext, SceneConfig, Store, errors, results, workbench
 from advsearch.questions.test import counterexamples, settings
 from advsearch.questions.test.claims import Trial, check_pictures
 from advsearch.questions.test.counterexamples import Counterexample
@@ -230,7 +221,7 @@ def _planned(suite: Suite, config: SuiteConfig, added: Counterexample | None) ->
     known = [*(claim.name for claim in planned), COUNTEREXAMPLES]
     for name in config.chosen:
         if name not in known:
-            raise UnknownNameError("claim in `only`", name, known)
+            raise errors.UnknownNameError("claim in `only`", name, known)
     every = not config.chosen
     chosen = [
         claim

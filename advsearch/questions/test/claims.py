@@ -15,17 +15,17 @@ from torch import Tensor
 
 from advsearch.extend import (
     AttackConfig,
-    Evaluation,
     InputError,
-    Judgement,
     Problem,
     Progress,
     RunContext,
     RunDirectory,
     SceneConfig,
+    policies,
     seeds,
     settings,
     statistics,
+    tasks,
     wording,
     workbench,
 )
@@ -178,18 +178,18 @@ class Trial:
     def _pairs(
         self, journal: workbench.Journal, queries: Iterator[workbench.Query], beside: workbench.Journal | None = None,
         shown: ChangePicture | None = None,
-    ) -> Iterator[tuple[workbench.Query, Evaluation, Evaluation | None]]:  # fmt: skip
+    ) -> Iterator[tuple[workbench.Query, policies.Evaluation, policies.Evaluation | None]]:  # fmt: skip
         """Yield queries, as many at once as there are workers for, until the time is over; with what is said of each,
         and what the other side says of what is `shown` to it of this picture; without, of a picture of its own."""
         pictures: dict[int, Tensor | None] = {}
 
-        def here(queries: Sequence[workbench.Query]) -> Iterator[Evaluation]:
+        def here(queries: Sequence[workbench.Query]) -> Iterator[policies.Evaluation]:
             evaluations = journal.traced([replace(query, keep=shown is not None) for query in queries])
             for query, evaluation in zip(queries, evaluations, strict=True):
                 pictures[query.number] = evaluation.picture
                 yield evaluation
 
-        def there(queries: Sequence[workbench.Query]) -> Iterable[Evaluation]:
+        def there(queries: Sequence[workbench.Query]) -> Iterable[policies.Evaluation]:
             assert beside is not None
             if shown is None:
                 yield from beside.traced(queries)
@@ -199,13 +199,13 @@ class Trial:
                 picture = pictures.get(query.number)  # what was asked before is read back, without its picture
                 if picture is None:
                     picture = problem.picture(query.u, query.seed, query.spp)
-                yield Evaluation.of(other.judge(shown(query, picture), other.whole(query.u)))
+                yield policies.Evaluation.of(other.judge(shown(query, picture), other.whole(query.u)))
 
         at_once = 1 if journal.traced.executor is None else AHEAD * (self.config.workers or 8)
         while batch := list(islice(queries, at_once)):
             pictures.clear()
-            mine: Iterable[Evaluation] = journal.evaluate_all(batch, here)
-            its: Iterable[Evaluation | None] = repeat(None)
+            mine: Iterable[policies.Evaluation] = journal.evaluate_all(batch, here)
+            its: Iterable[policies.Evaluation | None] = repeat(None)
             if beside is not None:
                 mine = list(mine)
                 its = beside.evaluate_all([replace(query, kind=f"{query.kind} beside") for query in batch], there)
@@ -265,7 +265,7 @@ class Trial:
 
     def _trials_of(
         self, journal: workbench.Journal, kind: str, u: Tensor, spp: int, *, over: bool
-    ) -> Iterator[tuple[workbench.Query, Judgement, Judgement | None]]:
+    ) -> Iterator[tuple[workbench.Query, tasks.Judgement, tasks.Judgement | None]]:
         """Yield trials of one configuration (d,), and of the clean scene in the same conditions where these vary."""
         problem = journal.problem
         queries = list[workbench.Query]()
@@ -349,7 +349,7 @@ def check_pictures(name: str, claim: AnyClaim, confidence: float) -> str:
 
 
 def valued(
-    claim: ShareClaim | NoWorseClaim, own: Evaluation, its: Evaluation | None
+    claim: ShareClaim | NoWorseClaim, own: policies.Evaluation, its: policies.Evaluation | None
 ) -> tuple[float | None, float, str]:
     """Return what a picture says for a claim, from 0 to 1, or None where the object is not to be seen; how bad an
     example it is of what is against it, and which."""

@@ -23,18 +23,18 @@ from torch import Tensor
 
 from advsearch.extend import (
     AttackConfig,
-    FileFormatError,
     InputError,
-    Judgement,
     Problem,
     RunDirectory,
     SceneConfig,
     SceneDescription,
-    find_run,
+    directory,
+    errors,
     seeds,
     settings,
     statistics,
     stored_files,
+    tasks,
     workbench,
     writing,
 )
@@ -202,7 +202,7 @@ def relative_to_here(values: Mapping[str, Any]) -> dict[str, Any]:
     return relative
 
 
-def outcome_of(trial: Judgement, clean: Judgement | None = None) -> bool | None:
+def outcome_of(trial: tasks.Judgement, clean: tasks.Judgement | None = None) -> bool | None:
     """Return whether the model is right in a trial, or None where the trial does not count: nothing of the object is in
     the picture, or the model is wrong on the clean scene under the same conditions."""
     if trial.prediction.is_out_of_view or (clean is not None and not clean.right):
@@ -247,7 +247,7 @@ def _is_wrong_on(example: Counterexample, problem: Problem, trials: int, *, over
 def add(suite: str, run: str) -> Counterexample:
     """Keep the adversarial scene of a run as a counterexample of a suite; an InputError where the run found nothing, or
     its scene is none."""
-    path = find_run(run)
+    path = directory.find_run(run)
     summary = workbench.attack_of(path)
     if summary.ending != "found" or summary.verified is None:
         raise InputError(f"add: expected a run that ended as 'found', got {path}, which ended with {summary.ending!r}")
@@ -295,7 +295,7 @@ def _make_thumbnail(path: Path) -> bytes:
             small = image.convert("RGB")
             small.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FileFormatError(f"{path}: expected a PNG picture, got {error}") from None
+        raise errors.FileFormatError(f"{path}: expected a PNG picture, got {error}") from None
     small.save(buffer, "JPEG", quality=85)
     return buffer.getvalue()
 
@@ -317,13 +317,13 @@ def _read(path: Path) -> Counterexample:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         got = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
-        raise FileFormatError(f"{path}: expected a counterexample, got one with {got}; remove it") from None
+        raise errors.FileFormatError(f"{path}: expected a counterexample, got one with {got}; remove it") from None
     except (OSError, ValueError, lzma.LZMAError) as error:
-        raise FileFormatError(f"{path}: expected a counterexample, got {str(error)[:80]}; remove it") from None
+        raise errors.FileFormatError(f"{path}: expected a counterexample, got {str(error)[:80]}; remove it") from None
     try:
         config = AttackConfig(**kept.settings)
     except InputError as error:
-        raise FileFormatError(f"{path}: settings: {error}") from None
+        raise errors.FileFormatError(f"{path}: settings: {error}") from None
     return Counterexample(path.stem, path, config, kept.said, kept.files, kept.scene, kept.spp, moved)
 
 
@@ -338,10 +338,10 @@ def read_expected(suite: str) -> dict[str, str]:
     try:
         values = stored_files.parse_json(stored_files.read_text(path, "what is expected of a suite", LARGEST))
     except (OSError, ValueError) as error:
-        raise FileFormatError(f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it") from None
+        raise errors.FileFormatError(f"{path}: expected verdicts by claim, got {str(error)[:80]}; remove it") from None
     verdicts = values.get("expected") if isinstance(values, dict) else None
     if not isinstance(verdicts, dict) or not set(map(str, verdicts.values())) <= set(VERDICTS):
-        raise FileFormatError(f"{path}: expected verdicts by claim, got something else; remove it")
+        raise errors.FileFormatError(f"{path}: expected verdicts by claim, got something else; remove it")
     return {str(name): str(verdict) for name, verdict in verdicts.items()}
 
 

@@ -15,11 +15,6 @@ from pydantic import Field
 
 from advsearch.extend import (
     AttackConfig,
-    Claim,
-    Fields,
-    InNotebook,
-    Interval,
-    Picture,
     ResultPart,
     RunResult,
     SceneConfig,
@@ -27,6 +22,7 @@ from advsearch.extend import (
     SweepConfig,
     __version__,
     results,
+    views,
     wording,
 )
 from advsearch.questions.test.settings import AnyClaim, ChangeClaim, NoWorseClaim, RightClaim
@@ -48,7 +44,7 @@ class Cause(str, Enum):
     OUT_OF_TIME = "out of time"
 
 
-class ClaimResult(Fields):
+class ClaimResult(results.Fields):
     """One claim, or one counterexample, and what came out."""
 
     name: str = Field(description="in the suite; of a counterexample, its file's")
@@ -63,7 +59,7 @@ class ClaimResult(Fields):
     rate: results.JsonFloat | None = results.optional(
         "share of right predictions, or of pictures as claimed; of two models the difference; absent of a search"
     )
-    interval: Interval | None = results.optional(
+    interval: results.Interval | None = results.optional(
         "of it: each end holds at all times together, at the suite's confidence; of a counterexample that "
         "of Clopper and Pearson, 95 %"
     )
@@ -81,7 +77,7 @@ class ClaimResult(Fields):
         return VERDICTS.index(self.answer) <= VERDICTS.index(self.expected)
 
 
-class SuiteResult(InNotebook, RunResult):
+class SuiteResult(views.InNotebook, RunResult):
     """What the claims of a suite came to."""
 
     command: ClassVar[str] = "test"
@@ -133,7 +129,7 @@ def shown(result: SuiteResult) -> ShownResult:
     for claim in result.claims:
         if claim.answer != HELD and claim.cause is not Cause.COUNTEREXAMPLE_FAILED:
             caption = f"{claim.statement}: {claim.answer}. {claim.reason}."
-            pictures = [[Picture(claim.picture, caption)]] if claim.picture else []
+            pictures = [[views.Picture(claim.picture, caption)]] if claim.picture else []
             sections.append(ResultPart(claim.name, rows=[["repeat", claim.repeat]], pictures=pictures))
     sections.append(ResultPart("Expected from now on", result.changes))
     about = [Path(result.suite).name, result.object, result.model]
@@ -298,17 +294,17 @@ def facts(result: SuiteResult) -> dict[str, str]:
     }
 
 
-def claims(result: SuiteResult) -> Iterator[Claim]:
+def claims(result: SuiteResult) -> Iterator[views.Claim]:
     for tried in result.claims:
         text = f"{tried.name}: that {tried.statement} is {tried.answer}: {tried.reason}."
         if tried.answer == UNDECIDED:
-            yield Claim(kind="nothing claimed", statement=text, extent=None)
+            yield views.Claim(kind="nothing claimed", statement=text, extent=None)
         elif tried.kind in ("not_broken", "counterexample"):
-            yield Claim(kind="found" if tried.answer == FAILED else "not found", statement=text, extent=None)
+            yield views.Claim(kind="found" if tried.answer == FAILED else "not found", statement=text, extent=None)
         else:
             sure = wording.percent(result.confidence)
             text += f" Each end of the interval is a confidence sequence at {sure}, in place of Clopper-Pearson's."
-            yield Claim(kind="measured", statement=text, extent=None)
+            yield views.Claim(kind="measured", statement=text, extent=None)
 
 
 SARIF_SCHEMA = "https://docs.oasis-open.org/sarif/sarif/v2.1.0/errata01/os/schemas/sarif-schema-2.1.0.json"
@@ -364,7 +360,7 @@ def sarif(result: SuiteResult) -> str:
         for kind in kinds
     ]
     lines = Path(result.suite).read_text("utf-8").splitlines() if Path(result.suite).is_file() else []
-    results = []
+    sarif_results = []
     for claim in result.claims:
         if claim.answer == HELD:
             continue
@@ -373,7 +369,7 @@ def sarif(result: SuiteResult) -> str:
         line = next((number for number, text in enumerate(lines, start=1) if begins.match(text)), 1)
         place = {"artifactLocation": {"uri": quote(result.suite)}, "region": {"startLine": line}}
         more = {"picture": _picture(result, claim), "repeat": claim.repeat, "pictures": claim.pictures}
-        results.append({
+        sarif_results.append({
             "ruleId": claim.kind,
             "ruleIndex": kinds.index(claim.kind),
             "level": "error" if claim.answer == FAILED else "warning",
@@ -385,7 +381,7 @@ def sarif(result: SuiteResult) -> str:
         })  # fmt: skip
     driver = {"name": "advsearch", "version": __version__, "rules": rules}
     invocation = {"executionSuccessful": not result.goes_on, "commandLine": result.command_line or ""}
-    run = {"tool": {"driver": driver}, "invocations": [invocation], "results": results}
+    run = {"tool": {"driver": driver}, "invocations": [invocation], "results": sarif_results}
     return json.dumps({"$schema": SARIF_SCHEMA, "version": "2.1.0", "runs": [run]}, indent=2, ensure_ascii=False) + "\n"
 
 

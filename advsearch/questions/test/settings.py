@@ -12,12 +12,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from advsearch.extend import (
     AttackConfig,
-    Clash,
     Config,
-    FileFormatError,
     InputError,
     SceneConfig,
     SweepConfig,
+    errors,
     setting,
     setting_as_in,
     settings,
@@ -34,13 +33,13 @@ class SuiteConfig(Config):
     free: ClassVar[tuple[str, ...]] = (
         *Config.free, "seconds", "workers", "cluster", "junit", "sarif", "markdown", "update",
     )
-    clashes: ClassVar[tuple[Clash, ...]] = (
+    clashes: ClassVar[tuple[settings.Clash, ...]] = (
         *SceneConfig.clashes,
-        Clash("fresh", lambda config: config.seed is not None,
+        settings.Clash("fresh", lambda config: config.seed is not None,
               "draws a seed, and `seed` says one; leave one of the two out"),
-        Clash("update", lambda config: config.add is not None,
+        settings.Clash("update", lambda config: config.add is not None,
               "renews what claims are expected to say; first `add`, then it"),
-        Clash("only", lambda config: config.add is not None,
+        settings.Clash("only", lambda config: config.add is not None,
               "names claims, and `add` tries the new counterexample alone; leave one of the two out"),
     )
 
@@ -262,9 +261,9 @@ def suite_of(data: Mapping[str, object], where: str) -> Suite:
     try:
         return Suite(**{name: value for name, value in data.items() if name not in ("schema", "command")})
     except ValidationError as error:
-        errors = error.errors(include_url=False)
-        first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])  # a slip in a name
-        raise FileFormatError(f"{where}: {_told(first)}") from None
+        details = error.errors(include_url=False)
+        first = next((each for each in details if each["type"] == "extra_forbidden"), details[0])  # a slip in a name
+        raise errors.FileFormatError(f"{where}: {_told(first)}") from None
 
 
 def _told(error: Any) -> str:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from advsearch.extend import FileFormatError, reading, stored_files
+from advsearch.extend import errors, reading, stored_files
 
 LONGEST = 120  # seconds that Blender may take, before `scaled`
 BEGINNINGS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
@@ -52,8 +52,12 @@ def convert_blend(path: Path, data: bytes) -> bytes:
                 path, "Blender", started, folder=folder, seconds=LONGEST, env=reading.surroundings(folder)
             )
         except OSError as error:
-            raise FileFormatError(f"{path}: Blender can't be started ({error.strerror}); check {program[0]}") from error
+            raise errors.FileFormatError(
+                f"{path}: Blender can't be started ({error.strerror}); check {program[0]}"
+            ) from error
         if done.returncode or not target.is_file():
             last = reading.last_line(done.stdout + done.stderr)
-            raise FileFormatError(f"{path}: Blender could not read it{last}; export glTF (.glb) from it yourself")
+            raise errors.FileFormatError(
+                f"{path}: Blender could not read it{last}; export glTF (.glb) from it yourself"
+            )
         return reading.read_bytes(target, "object", (".glb",))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import advsearch
-from advsearch.extend import Exporter, InputError, Progress, find_run, models, render_rows, tasks, writing
+from advsearch.extend import Exporter, InputError, Progress, directory, exports, models, tasks, writing
 
 IMAGES, LABELS, COCO, YOLO = "images", "labels", "annotations.json", "data.yaml"  # what is in the folder of a dataset
 
@@ -58,7 +58,7 @@ def write_dataset(run: str, out: Path, format: str, *, every: bool, progress: Pr
     a reader has to know. Raises InputError where the scene of the run is not to be had any more, or `out` is not empty,
     and FileFormatError where the run is of another command, or has not ended."""
     writing.check_free_folder(out, "out")
-    find_run(run)  # refuses before anything is written
+    directory.find_run(run)  # refuses before anything is written
     categories = Categories()
     with writing.placed_by("out"):
         with writing.storage_errors(out):
@@ -67,7 +67,7 @@ def write_dataset(run: str, out: Path, format: str, *, every: bool, progress: Pr
         with kept:
             place, images = Path(kept.name) / "dataset", list[dict[str, Any]]()
             things, others = list[dict[str, Any]](), 0
-            for number, shown in enumerate(render_rows(run, every=every, progress=progress), 1):
+            for number, shown in enumerate(exports.render_rows(run, every=every, progress=progress), 1):
                 seen = categories.find_things(shown)
                 Exporter.write_png(place / IMAGES / f"{shown.name}.png", shown.picture.numpy())
                 images.append(make_image(number, shown))

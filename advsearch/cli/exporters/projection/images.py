@@ -11,7 +11,7 @@ import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from advsearch.extend import AdversarialRun, Control, Exporter, InputError, color, images, seeds, writing
+from advsearch.extend import Control, Exporter, InputError, color, exports, images, seeds, writing
 
 ROWS = 1024  # least height of the pictures to project, in pixels
 SHARES = (1 / 8, 1 / 2, 7 / 8)  # where the nine marks are in a picture, of its width and height
@@ -25,7 +25,7 @@ def write_projection(run: str | Path, out: Path) -> list[str]:
     projector, or the folder is there already."""
     if os.path.lexists(out):
         raise InputError(f"out: {out} is there already; choose another name")
-    adversarial = AdversarialRun.load(run)
+    adversarial = exports.AdversarialRun.load(run)
     slices = adversarial.problem.space.slices(adversarial.u)
     projectors: list[tuple[Any, Tensor]] = [(control, part) for control, part in slices if has_pattern(control)]
     if not projectors:

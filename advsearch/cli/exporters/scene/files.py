@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 import advsearch
-from advsearch.extend import AdversarialRun, InputError, mitsuba_data, parts, reading, writing
+from advsearch.extend import InputError, exports, mitsuba_data, parts, reading, writing
 
 GLB, XML = ".glb", ".xml"
 
@@ -26,7 +26,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     there = [file for file in taken if os.path.lexists(file)]
     if there or path.parent.is_file() or os.path.islink(out):
         raise InputError(f"out: {(there or [path.parent])[0]} is there already; choose another name")
-    adversarial = AdversarialRun.load(run)
+    adversarial = exports.AdversarialRun.load(run)
     renderer = adversarial.problem.renderer
     inputs, on_picture = adversarial.split_inputs()
     backdrop = on_picture.get("backdrop.color")
@@ -75,7 +75,7 @@ def write_gltf(run: str | Path, out: Path) -> list[str]:
     and InputError where the file is called otherwise."""
     if out.suffix.lower() != GLB:
         raise InputError(f"out: expected the name of a .glb file, got {out}")
-    adversarial = AdversarialRun.load(run)
+    adversarial = exports.AdversarialRun.load(run)
     part, found = adversarial.posed_object()
     description = adversarial.problem.space.scene
     metres = None if description is None else description.object.metres

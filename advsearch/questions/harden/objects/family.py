@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.extend import assets, library
+from advsearch.extend import assets, workbench
 from advsearch.questions.harden.objects.shapes import Array, Patch
 from advsearch.questions.harden.objects.textures import Draw, Paint, Texels
 
@@ -168,10 +168,13 @@ class ObjectFamily:
             materials = {str(tag): np.nonzero(tags_of == tag)[0] for tag in dict.fromkeys(tags_of)}
             mesh = replace(mesh, materials=materials, rig=instance.rig)
         extent = np.ptp(np.concatenate([patch.vertices for patch in patches]), axis=0).max()
+        surface = None
+        if instance.finishes:
+            surface = workbench.library.finished(mesh, instance.finishes, instance.material)
         return assets.ObjectAsset(
             name=self.name, mesh=mesh, base_color=painted(patches, charts, instance.paints, self.texels),
-            material=instance.material, label=self.label, source=library.BUNDLED_OBJECT,
-            surface=library.finished(mesh, instance.finishes, instance.material) if instance.finishes else None,
+            material=instance.material, label=self.label, source=workbench.library.BUNDLED_OBJECT,
+            surface=surface,
             finishes=instance.finishes, metres=round(float(extent) * self.metres, 4), drives=instance.drives,
         )  # fmt: skip
 

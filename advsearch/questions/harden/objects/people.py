@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
-from advsearch.extend import assets, library
+from advsearch.extend import assets, workbench
 from advsearch.questions.harden.objects.family import Instance, family
 from advsearch.questions.harden.objects.shapes import Array, Patch, Rest
 from advsearch.questions.harden.objects.textures import Draw, Texels, hexed, mix, noise, painter, step
@@ -112,7 +112,7 @@ def person(draw: Draw) -> Instance:
         "weight": draw(0.5, 0.25, 0.8), "age": draw(35.0, 16.0, 75.0), "stride": draw(0.0, 0.0, 1.2),
         "walk": draw(0.0, 0.0, 360.0),
     }  # fmt: skip
-    body = library.make_person(about)
+    body = workbench.library.make_person(about)
     skin = hexed(draw.pick("d9a98a", "e8c3a8", "c68863", "8d5a3a", "5c3a28", "f0cfb4"))
     hair = hexed(draw.pick("2e2019", "120d0a", "5a3a20", "8a6a3c", "9a948c"))
     paints = {

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from advsearch.extend import FileFormatError, reading, stored_files
+from advsearch.extend import errors, reading, stored_files
 
 PACKAGE = ".usdz"
 LAYERS = (".usd", ".usda", ".usdc")
@@ -43,7 +43,7 @@ def convert_usd(path: Path, data: bytes) -> bytes:
     if not data.startswith(USD_BEGINNINGS):
         raise reading.damaged(path, "an OpenUSD file", reading.looks_like(data))
     if not is_installed():
-        raise FileFormatError(
+        raise errors.FileFormatError(
             f"{path}: an OpenUSD file needs usd-core, which is not installed: pip install 'advsearch[usd]'; or export "
             "glTF (.glb) where it is from"
         )
@@ -60,9 +60,11 @@ def convert_usd(path: Path, data: bytes) -> bytes:
             last = lines[-1]
             if last.startswith(REFUSED):
                 text = last.removeprefix(REFUSED)
-                raise FileFormatError(f"{path.parent / text}" if text.startswith(path.name) else f"{path}: {text}")
+                raise errors.FileFormatError(
+                    f"{path.parent / text}" if text.startswith(path.name) else f"{path}: {text}"
+                )
             crashed = f"signal {-done.returncode}" if done.returncode < 0 else reading.shown(last.strip(), quoted=False)
-            raise FileFormatError(f"{path}: usd-core could not read it ({crashed}); export or download it again")
+            raise errors.FileFormatError(f"{path}: usd-core could not read it ({crashed}); export or download it again")
         for name in json.loads(done.stdout.splitlines()[-1]):
             stored_files.note_opened(name)
         return stored_files.read_bytes(target, "a glTF file", 4 * stored_files.LARGEST_FILE)

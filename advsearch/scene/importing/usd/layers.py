@@ -17,7 +17,7 @@ from typing import Any
 
 from pxr import Ar, Sdf
 
-from advsearch.extend import FileFormatError, reading, stored_files
+from advsearch.extend import errors, reading, stored_files
 from advsearch.scene.importing.usd import LAYERS, PACKAGE
 
 MOST_LAYERS = 1000
@@ -58,17 +58,17 @@ def open_package(name: str, content: bytes) -> zipfile.ZipFile:
             place = PurePosixPath(entry.filename)
             odd = place.is_absolute() or ".." in place.parts or re.search(r"[\\:\[\]]", entry.filename)
             if odd or entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 1:
-                raise FileFormatError(
+                raise errors.FileFormatError(
                     f"{name}: expected files that lie in it as they are, got {entry.filename[:80]!r}, "
                     "which is packed or lies elsewhere; make it again with usdzip"
                 )
         for entry in entries:
             archive.open(entry).close()  # local headers are there
     except (zipfile.BadZipFile, OSError, EOFError, ValueError, NotImplementedError) as error:
-        raise FileFormatError(f"{name}: expected a .usdz archive, got one that is damaged ({error})") from None
+        raise errors.FileFormatError(f"{name}: expected a .usdz archive, got one that is damaged ({error})") from None
     first = first_layer(archive)
     if Path(first).suffix.lower() not in LAYERS:
-        raise FileFormatError(f"{name}: expected a USD layer first in it, got {first[:80]!r}")
+        raise errors.FileFormatError(f"{name}: expected a USD layer first in it, got {first[:80]!r}")
     return archive
 
 
@@ -79,7 +79,7 @@ def _check_without_gaps(name: str, archive: zipfile.ZipFile, content: bytes) -> 
         lengths = content[entry.header_offset + 26 : entry.header_offset + 30]
         header_size = 30 + int.from_bytes(lengths[:2], "little") + int.from_bytes(lengths[2:], "little")
         if entry.header_offset != position:
-            raise FileFormatError(
+            raise errors.FileFormatError(
                 f"{name}: expected a .usdz archive with one file after the other, got bytes in between; "
                 "make it again with usdzip"
             )
@@ -157,17 +157,19 @@ class _LayerCheck:
         is_plain = is_plain and (not inner or suffix == PACKAGE)
         target = Path(os.path.realpath(path.parent / outer)) if is_plain else self._folder
         if not is_plain or not reading.is_inside(target, self._folder):
-            raise FileFormatError(
+            raise errors.FileFormatError(
                 f"{self.file.name}: names the layer {name[:100]!r}, which is no USD file in its folder and is not "
                 "read; put it there, or make one file of all with usdcat --flatten"
             )
         if not target.is_file():
-            raise FileFormatError(f"{self.file.name}: needs {name[:100]!r}, which is missing; put that file beside it")
+            raise errors.FileFormatError(
+                f"{self.file.name}: needs {name[:100]!r}, which is missing; put that file beside it"
+            )
         if inner:
             try:
                 read_packaged(Ar.JoinPackageRelativePath(str(target), inner))
             except KeyError:
-                raise FileFormatError(
+                raise errors.FileFormatError(
                     f"{self.file.name}: needs {name[:100]!r}, which is not in {target.name}; make the package again"
                 ) from None
         return target
@@ -196,7 +198,7 @@ class _LayerCheck:
         from_root = os.path.normpath(outer)  # not anchored: of the package's root
         is_inside = near in entries or (not outer.startswith(".") and from_root in entries)
         if not is_inside or Path(outer).suffix.lower() not in (*LAYERS, PACKAGE):
-            raise FileFormatError(
+            raise errors.FileFormatError(
                 f"{self.file.name}: {package} names the layer {named[:100]!r}, which is no USD file in that package "
                 "and is not read; make the package again with usdzip, or one file of all with usdcat --flatten"
             )
@@ -206,16 +208,16 @@ class _LayerCheck:
         try:
             layer = Sdf.Layer.FindOrOpen(path)
         except Exception as error:  # Tf.ErrorException, of which there are many kinds
-            raise FileFormatError(f"{name}: expected a USD layer, got {shorten(error)}") from None
+            raise errors.FileFormatError(f"{name}: expected a USD layer, got {shorten(error)}") from None
         if layer is None:
-            raise FileFormatError(f"{name}: expected a USD layer, got none that can be read")
+            raise errors.FileFormatError(f"{name}: expected a USD layer, got none that can be read")
         yield from filter(None, layer.GetCompositionAssetDependencies())
 
         def check(at: Any) -> None:
             spec = layer.GetObjectAtPath(at) if at.IsPrimPath() else None
             if spec is not None and "clips" in spec.ListInfoKeys():
                 what = f"has value clips ({at}), which are not read"
-                raise FileFormatError(f"{self.file.name}: {what}; make one file of all with usdcat --flatten")
+                raise errors.FileFormatError(f"{self.file.name}: {what}; make one file of all with usdcat --flatten")
 
         layer.Traverse(Sdf.Path.absoluteRootPath, check)
 

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel, Vt
 
-from advsearch.extend import FileFormatError, reading, stored_files
+from advsearch.extend import errors, reading, stored_files
 from advsearch.scene.importing.usd import PACKAGE
 from advsearch.scene.importing.usd.layers import check_layers, unpacked
 from advsearch.scene.importing.usd.surface import FIRST, BoundMaterial, Layout, PrimvarUse, UsdSurfaces
@@ -82,7 +82,7 @@ class Conversion:
     def glb(self) -> bytes:
         unit = UsdGeom.GetStageMetersPerUnit(self.stage)
         if not 0.0 < unit < math.inf:
-            raise FileFormatError(f"{self.source}: expected metersPerUnit greater than 0, got {unit}")
+            raise errors.FileFormatError(f"{self.source}: expected metersPerUnit greater than 0, got {unit}")
         if not UsdGeom.StageHasAuthoredMetersPerUnit(self.stage):
             self._leave("does not say its unit, which USD takes for centimetres")
         if self.stage.HasAuthoredTimeCodeRange():
@@ -113,7 +113,9 @@ class Conversion:
             if moves:
                 local = np.array(moves.GetLocalTransformation(FIRST))  # rows, as glTF's columns
                 if not np.isfinite(local).all():
-                    raise FileFormatError(f"{self.source}: expected finite transforms, got others at {prim.GetPath()}")
+                    raise errors.FileFormatError(
+                        f"{self.source}: expected finite transforms, got others at {prim.GetPath()}"
+                    )
                 node["matrix"] = local.ravel().tolist()
             if not (moves and moves.GetResetXformStack()):
                 parent = next((places[at] for at in prim.GetPath().GetAncestorsRange() if at in places), 0)
@@ -129,7 +131,7 @@ class Conversion:
         header["scenes"], header["scene"] = [{"nodes": [0]}], 0
         if has_splats and not header["meshes"]:
             what = f"expected a mesh with faces, got Gaussian splats, a model that {reading.SPLATS}"
-            raise FileFormatError(f"{self.source}: {what}")
+            raise errors.FileFormatError(f"{self.source}: {what}")
         if self.lights:
             header["extensions"] = {"KHR_lights_punctual": {"lights": self.lights}}
         notes = [what if count == 1 else f"{what} ({count:,} times)" for what, count in self.left.items()]
@@ -195,7 +197,9 @@ class Conversion:
             self._leave(f"has a {kind}, which is left out; `environment` and `controls=light` light a scene")
             return
         if not (math.isfinite(power) and power >= 0.0 and np.isfinite(color).all() and (color >= 0.0).all()):
-            raise FileFormatError(f"{self.source}: expected the light {node['name']} to have a power of at least 0")
+            raise errors.FileFormatError(
+                f"{self.source}: expected the light {node['name']} to have a power of at least 0"
+            )
         node["extensions"] = {"KHR_lights_punctual": {"light": len(self.lights)}}
         self.lights.append({**entry, "name": node["name"], "color": color.tolist(), "intensity": power})
 
@@ -210,7 +214,9 @@ class Conversion:
         if not len(points) or not len(counts):
             return
         if (counts < 0).any() or counts.sum() != len(corners) or corners.min() < 0 or corners.max() >= len(points):
-            raise FileFormatError(f"{self.source}: expected faces of the points of {path}, got others; export it again")
+            raise errors.FileFormatError(
+                f"{self.source}: expected faces of the points of {path}, got others; export it again"
+            )
         moved, points = self._at_rest(prim, points)
         if moved is not None:
             node["moved"] = moved.ravel().tolist()
@@ -259,7 +265,7 @@ class Conversion:
         for values, per in (given or (None, "") for given in held.values()):
             index.append(none if values is None else by.get(per, none))
             if values is not None and index[-1].max() >= len(values):
-                raise FileFormatError(f"{self.source}: expected as many values as corners on {path}, got fewer")
+                raise errors.FileFormatError(f"{self.source}: expected as many values as corners on {path}, got fewer")
         rows, inverse = np.unique(np.stack(index, axis=1), axis=0, return_inverse=True)
         attributes = {"POSITION": self.buffer.accessor(points[rows[:, 0]].astype(np.float32), "VEC3", bounds=True)}
         for column, (name, given) in enumerate(held.items(), 1):
@@ -410,5 +416,5 @@ def _smooth(points: Array, faces: Array) -> Array:
 if __name__ == "__main__":
     try:
         main(*sys.argv[1:])
-    except FileFormatError as error:
+    except errors.FileFormatError as error:
         sys.exit(f"refused: {error}")

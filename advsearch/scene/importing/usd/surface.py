@@ -20,7 +20,7 @@ import numpy.typing as npt
 from PIL import Image
 from pxr import Ar, Usd, UsdShade
 
-from advsearch.extend import FileFormatError, color, reading, stored_files
+from advsearch.extend import color, errors, reading, stored_files
 from advsearch.scene.importing.usd.layers import read_packaged, shorten
 from advsearch.scene.importing.usd.pictures import (
     EXR,
@@ -260,7 +260,7 @@ class UsdSurfaces:
         if key not in self._texels:
             try:
                 self._texels[key] = decode_picture(use.data, use.path, is_srgb=use.is_srgb)
-            except (OSError, ValueError, SyntaxError, EOFError, FileFormatError) as error:
+            except (OSError, ValueError, SyntaxError, EOFError, errors.FileFormatError) as error:
                 self.leave(f"the texture {use.path[:100]!r} cannot be read ({shorten(error)})")
                 return None
         return self._texels[key]
@@ -419,7 +419,9 @@ class PreviewSurface:
             else:
                 self.surfaces.leave(f"has a texture that is looked up by {node.kind[:100]}; st is taken for it")
                 return Layout("st", None, rows)
-        raise FileFormatError(f"the material {self.name}: expected at most {MOST_NODES} shaders in a row, got more")
+        raise errors.FileFormatError(
+            f"the material {self.name}: expected at most {MOST_NODES} shaders in a row, got more"
+        )
 
     def _constant_layout(self, node: Shader, name: str, matrix: Array) -> Layout:
         self.surfaces.leave("has a texture without texture coordinates (st), of which one texel is shown")
