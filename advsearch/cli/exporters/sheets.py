@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.extend import Exported, Exporter, Progress
-from advsearch.options import rounded
-from advsearch.trust.writing import placed_by, replacing
+from advsearch.extend import Exported, Exporter, Progress, writing
 
 USUAL_SIZE = 100.0  # longest side of a printed object whose size is not known, in millimetres
 
@@ -23,21 +21,23 @@ class Sheets(Exporter):
     options = ("size", "sheets", "paper", "icc")
 
     def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
-        from advsearch.api.chart import chart_page  # draws with matplotlib
-        from advsearch.api.export import printable, real_size  # takes seconds
-        from advsearch.report.sheets import MOST_SHEETS, write_sheets  # draws with matplotlib
+        from advsearch.extend import exports  # takes seconds
 
-        known_size = real_size(run) if options["size"] is None else options["size"]
+        known_size = exports.real_size(run) if options["size"] is None else options["size"]
         longest = USUAL_SIZE if known_size is None else known_size
-        pieces = printable(run, longest)
+        pieces = exports.printable(run, longest)
         profile = None if options["icc"] is None else Path(options["icc"])
-        title = f"{Path(run).name}, object of {rounded(longest)} mm"
+        title = f"{Path(run).name}, object of {exports.rounded(longest)} mm"
         paper = (options["paper"] or "a4").lower()
-        most = MOST_SHEETS if options["sheets"] is None else options["sheets"]
-        with placed_by("out"), replacing(out) as part:
-            pages = write_sheets(part, pieces, title, paper=paper, profile=profile, most=most, last=chart_page)
+        most = exports.MOST_SHEETS if options["sheets"] is None else options["sheets"]
+        with writing.placed_by("out"), writing.replacing(out) as part:
+            pages = exports.write_sheets(
+                part, pieces, title, paper=paper, profile=profile, most=most, last=exports.chart_page
+            )
         sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
         text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
         if known_size is None:
-            text += f"\nThe real object's longest side is taken for {rounded(longest)} mm; --size says otherwise."
+            text += (
+                f"\nThe real object's longest side is taken for {exports.rounded(longest)} mm; --size says otherwise."
+            )
         return Exported({"pages": pages, "size_mm": longest, "pieces": sizes}, text)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from advsearch.extend import Exported, Exporter, InputError, Progress, Store, directory, exports, writing
+from advsearch.extend import Exported, Exporter, InputError, Progress, Store, directory, writing
 
 DETAILS, CLASSES, IMAGES = "details.log", "class_maps.json", "images"
 PLACED = ("environment", "object")  # values that have a place of their own in a line
@@ -72,6 +72,8 @@ class ThreeDB(Exporter):
     options = ("kind",)
 
     def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+        from advsearch.extend import exports  # takes seconds
+
         run_path = directory.find_run(run)
         kept = exports.thumbnails.kept_pictures(run_path)
         with Store(run_path / Store.FILE, read_only=True) as store:
