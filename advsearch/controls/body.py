@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from advsearch.extend import Choice, Control, InputError, Parameter, Value, Values, errors, parts
+from advsearch.extend import Choice, Control, InputError, Parameter, Value, Values, assets, errors, geometry
 
 
 class BodyControl(Control):
@@ -15,17 +15,17 @@ class BodyControl(Control):
 
     kind = "body"
     of_a_mesh = True
-    parameters = (*parts.PERSON, parts.TIME)
+    parameters = (*geometry.PERSON, geometry.TIME)
     choices = (Choice("clip", None, "Name or number of the animation that `time` is of; by itself the first."),)
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
         known = {parameter.name for parameter in cls.parameters}
-        declared = (parts.part_of_a_rig(name) for name in settings if name not in known)
+        declared = (geometry.part_of_a_rig(name) for name in settings if name not in known)
         return (*cls.parameters, *(parameter for parameter in declared if parameter is not None))
 
     @property
-    def rig(self) -> parts.MeshRig:
+    def rig(self) -> assets.MeshRig:
         """What moves the mesh."""
         mesh = self.mesh_in(self.scene)
         if mesh.mesh.rig is None:
@@ -40,7 +40,7 @@ class BodyControl(Control):
         """The name of the animation that is played; None for none."""
         clips, asked = self.rig.clips, self.chosen["clip"]
         if asked is None:
-            timed = parts.TIME.name in self.specs or not self._given
+            timed = geometry.TIME.name in self.specs or not self._given
             return clips[0] if clips and timed else None
         number = int(asked) if Parameter.is_number(asked) or str(asked).isdigit() else -1
         if asked not in clips and not 0 <= number < len(clips):

@@ -30,6 +30,7 @@ from advsearch.extend import (
     SceneDescription,
     Value,
     Values,
+    assets,
     color,
     geometry,
     images,
@@ -54,7 +55,7 @@ TOTAL = 1e-6  # how far proportions may miss one
 RADIUS = 0.995  # the disc ends this close to the wall, as a share of its distance
 FIRST = 0.02
 """Below this level the disc is drawn together and sunk into the floor, so that an empty vessel shows none of it."""
-SURFACE = parts.Material(roughness=0.08, specular=0.5)
+SURFACE = assets.Material(roughness=0.08, specular=0.5)
 
 
 _lit = partial(Parameter.number, Parameter.LIT)
@@ -64,14 +65,14 @@ _lit = partial(Parameter.number, Parameter.LIT)
 class Vessel:
     """The inside of a vessel that stands upright."""
 
-    axis: parts.Doubles  # (2,) x and y of the line that the wall is seen from
-    heights: parts.Doubles  # (R,) evenly spaced z, from the floor to the brim
-    radii: parts.Doubles  # (R, K) distance of the wall from the axis, in K even directions from +x counter-clockwise
-    color: parts.Doubles  # (3,) linear reflectance of the wall's lower half
+    axis: assets.Doubles  # (2,) x and y of the line that the wall is seen from
+    heights: assets.Doubles  # (R,) evenly spaced z, from the floor to the brim
+    radii: assets.Doubles  # (R, K) distance of the wall from the axis, in K even directions from +x counter-clockwise
+    color: assets.Doubles  # (3,) linear reflectance of the wall's lower half
 
 
 @lru_cache(maxsize=8)
-def interior(asset: parts.ObjectAsset) -> Vessel | None:
+def interior(asset: assets.ObjectAsset) -> Vessel | None:
     """Find the inside of an object in its default pose; None if it is no vessel."""
     mesh = asset.mesh
     basin = _basin(mesh)
@@ -96,7 +97,7 @@ def interior(asset: parts.ObjectAsset) -> Vessel | None:
     return Vessel(axis, heights, radii, np.asarray(wall_color, dtype=np.float64))
 
 
-def _basin(mesh: parts.Mesh) -> tuple[parts.Doubles, float, float] | None:
+def _basin(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float] | None:
     """Return the axis (2,), the floor and the rim of the largest basin, or None if there is none worth the name."""
     low, cell, ground = _height_map(mesh)
     water = _filled(ground)
@@ -114,7 +115,7 @@ def _basin(mesh: parts.Mesh) -> tuple[parts.Doubles, float, float] | None:
     return axis, float(ground[mine].min()), float(water[mine].max())
 
 
-def _height_map(mesh: parts.Mesh) -> tuple[parts.Doubles, float, parts.Doubles]:
+def _height_map(mesh: assets.Mesh) -> tuple[assets.Doubles, float, assets.Doubles]:
     """Highest surface over a grid with an empty margin: place of cell (0, 0), side of a cell, (h, w) heights. Edges are
     drawn as well as faces, so that a thin upright wall is not missed between two cells."""
     vertices = mesh.vertices.astype(np.float64)
@@ -135,7 +136,7 @@ def _height_map(mesh: parts.Mesh) -> tuple[parts.Doubles, float, parts.Doubles]:
     return low, cell, ground
 
 
-def _filled(ground: parts.Doubles) -> parts.Doubles:
+def _filled(ground: assets.Doubles) -> assets.Doubles:
     """The level of water on a height map (h, w) from whose edges it runs off. Every cell stands as high as its ground
     or its lowest neighbour's water, whichever is higher; repeated until nothing changes."""
     water = np.full_like(ground, np.inf)
@@ -149,7 +150,7 @@ def _filled(ground: parts.Doubles) -> parts.Doubles:
         water[1:-1, 1:-1] = level
 
 
-def _wall(mesh: parts.Mesh, axis: parts.Doubles, height: float) -> tuple[parts.Doubles, parts.Ints]:
+def _wall(mesh: assets.Mesh, axis: assets.Doubles, height: float) -> tuple[assets.Doubles, assets.Ints]:
     """Cast level rays from the axis at one height. Returns the (COLUMNS,) distance of the first surface in each
     direction, infinite where there is none, and its face or -1."""
     corners = mesh.vertices[mesh.faces.astype(np.int64)].astype(np.float64)

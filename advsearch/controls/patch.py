@@ -34,10 +34,10 @@ from advsearch.extend import (
     Range,
     SceneDescription,
     Values,
+    assets,
     color,
     geometry,
     images,
-    parts,
 )
 
 BASE_COLOR = "object.base_color"
@@ -158,7 +158,7 @@ def towards_camera(scene: SceneDescription) -> tuple[float, float]:
     return math.degrees(math.atan2(y, x)) % 360.0, 0.5 + lift / math.pi
 
 
-def _shape(mesh: parts.Mesh) -> tuple[parts.Doubles, float, float]:
+def _shape(mesh: assets.Mesh) -> tuple[assets.Doubles, float, float]:
     """Middle (3,) of a mesh, its largest half-width and its half-height."""
     low, high = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
     half = np.maximum((high - low) / 2.0, 1e-6)
@@ -277,7 +277,7 @@ class Sticker:
         )
 
 
-def _frame(normal: parts.Doubles, upwards: parts.Doubles) -> parts.Doubles:
+def _frame(normal: assets.Doubles, upwards: assets.Doubles) -> assets.Doubles:
     """Rows right, up, normal (3, 3) of a right-handed frame with `up` as near to a direction as the normal lets it."""
     up = upwards - float(upwards @ normal) * normal
     if float(np.linalg.norm(up)) < 1e-6:
@@ -288,8 +288,8 @@ def _frame(normal: parts.Doubles, upwards: parts.Doubles) -> parts.Doubles:
 
 
 def unrolled(
-    offsets: parts.Doubles, normals: parts.Doubles, frame: parts.Doubles
-) -> tuple[parts.Doubles, parts.Doubles]:
+    offsets: assets.Doubles, normals: assets.Doubles, frame: assets.Doubles
+) -> tuple[assets.Doubles, assets.Doubles]:
     """Return coordinates (N, 2) of points along a surface, to the right and upwards, and normals' cosines (N,).
 
     In the tangent plane a point of a circle of radius R lies at `R sin(phi)` where its arc is `R phi`, phi being the

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.extend import Choice, Control, Parameter, SceneDescription, Value, Values, geometry, parts
+from advsearch.extend import Choice, Control, Parameter, SceneDescription, Value, Values, assets, geometry, parts
 
 SMALLEST = 0.01  # a smaller card is put away
 FARTHEST, STEPS = 8.0, 12
@@ -59,7 +59,7 @@ class ShadowControl(Control):
         texel = np.full((2, 2, 3), 0.1, dtype=np.float32)
         away = geometry.put_away(torch.from_numpy(geometry.camera_to_world(scene))).numpy()
         card = parts.polygon(int(self.chosen["corners"]))
-        return scene.with_part(parts.MeshPart(self.name, card, texel, parts.Material(roughness=1.0), to_world=away))
+        return scene.with_part(parts.MeshPart(self.name, card, texel, assets.Material(roughness=1.0), to_world=away))
 
     def in_scene(self, parameter: Parameter) -> Parameter:
         x, y, z = strongest_light(self.scene)[0]
@@ -97,7 +97,7 @@ class ShadowControl(Control):
             )
         }
 
-    def _axes(self, values: Values) -> parts.Doubles:
+    def _axes(self, values: Values) -> assets.Doubles:
         """Rows: to the right and upwards as seen from the light, and towards it."""
         left, up, outwards = geometry.camera_axes(
             float(values["azimuth"].detach()), float(values["elevation"].detach()), 0.0
@@ -132,7 +132,7 @@ class ShadowControl(Control):
 
 
 @lru_cache(maxsize=8)
-def strongest_light(scene: SceneDescription) -> tuple[parts.Doubles, float]:
+def strongest_light(scene: SceneDescription) -> tuple[assets.Doubles, float]:
     """Return the unit way (3,) from the object's middle to what puts most light on a surface that faces it, and how far
     that is: a lamp, or the brightest place of the environment above the ground, infinitely far."""
     found, far, most = np.array([0.0, 0.0, 1.0]), math.inf, 0.0

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.extend import Choice, Control, Parameter, SceneDescription, Values, color, mitsuba_data, parts
+from advsearch.extend import Choice, Control, Parameter, SceneDescription, Values, assets, color, mitsuba_data
 
 ROWS, COLUMNS = 256, 512  # size of the map
 SUN_RADIUS = math.radians(1.5)  # radius of the sun in the map, radians; half of its light comes from within 0.7 degrees
@@ -162,7 +162,7 @@ class SkyControl(Control):
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         bound = self.bind(scene)
         radiance = bound.radiance(bound.values(bound.start)).numpy().astype(np.float32)
-        sky = parts.EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
+        sky = assets.EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
         return replace(scene, environment=sky).with_values(environment__rotation=0.0, environment__exposure=0.0)
 
     def fit(self) -> None:

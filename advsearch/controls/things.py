@@ -30,6 +30,7 @@ from advsearch.extend import (
     SceneDescription,
     Value,
     Values,
+    assets,
     errors,
     geometry,
     parts,
@@ -46,7 +47,7 @@ _moving = partial(Parameter.moving, Parameter.ORBIT)
 class Stand(NamedTuple):
     """Where a thing stands, in the coordinates of the scene."""
 
-    place: parts.Doubles  # (2,) of its middle
+    place: assets.Doubles  # (2,) of its middle
     height: float  # of the ground there
     pushed: float  # how far it was moved away from the object
 
@@ -168,7 +169,7 @@ class ThingsControl(Control):
         return stands
 
 
-def _foot(part: parts.MeshPart) -> parts.Doubles:
+def _foot(part: parts.MeshPart) -> assets.Doubles:
     """Where a thing is put and turned about, (3,): the middle of its box, at the height of its lowest point."""
     low, high = part.mesh.vertices.min(axis=0), part.mesh.vertices.max(axis=0)
     foot = np.array([*(low[:2] + high[:2]) / 2.0, low[2]], np.float64)

@@ -29,6 +29,9 @@ from torch import Tensor
 from advsearch.scene.assets import Doubles, pose_of
 from advsearch.scene.camera_model import CameraModel as CameraModel
 from advsearch.scene.parts import Footprint, MeshPart
+from advsearch.scene.rigged import PERSON as PERSON
+from advsearch.scene.rigged import TIME as TIME
+from advsearch.scene.rigged import part_of_a_rig as part_of_a_rig
 from advsearch.scene.settings import ORBIT_CAMERA, POSE, SETTINGS
 from advsearch.scene.skeleton import entries_of_turn as entries_of_turn
 

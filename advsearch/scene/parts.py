@@ -15,18 +15,15 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
-from advsearch.scene.assets import Doubles as Doubles
-from advsearch.scene.assets import EnvironmentAsset as EnvironmentAsset
-from advsearch.scene.assets import Floats, Shape, pose_of
-from advsearch.scene.assets import Ints as Ints
-from advsearch.scene.assets import Material as Material
-from advsearch.scene.assets import Mesh as Mesh
-from advsearch.scene.assets import MeshRig as MeshRig
-from advsearch.scene.assets import ObjectAsset as ObjectAsset
-from advsearch.scene.assets import normalised as normalised
-from advsearch.scene.rigged import PERSON as PERSON
-from advsearch.scene.rigged import TIME as TIME
-from advsearch.scene.rigged import part_of_a_rig as part_of_a_rig
+from advsearch.scene.assets import (
+    Doubles,
+    Floats,
+    Ints,
+    Material,
+    Mesh,
+    Shape,
+    pose_of,
+)
 
 if TYPE_CHECKING:
     from advsearch.scene.places.place_file import Place

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.api.keywords import configured
+from advsearch.attacks import make_policy
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS
 from advsearch.controls import Control
@@ -253,7 +254,7 @@ def test_what_an_attack_takes_beside_its_settings_is_read_as_they_are(asked: Cal
     assert (job.scene.description.environment_name, job.scene.description.values["camera.azimuth"]) == ("loft", 3.0)
     assert job.scene.description.values["camera.exposure"] == 1.0
     job = asked("mug", policy={"name": "pgd", "momentum": np.float64(0.5)}, camera=["orbit"], task=["classification"])
-    assert "momentum: 0.5" in job.config.to_yaml() and job.policy == "pgd"
+    assert "momentum: 0.5" in job.config.to_yaml() and job.policy == make_policy("pgd", momentum=0.5)
     assert asked("mug", controls={"pose": {"yaw": np.array([0.0, 90.0])}}).config.controls == {
         "pose": {"yaw": [0.0, 90.0]}
     }

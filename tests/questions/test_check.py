@@ -221,7 +221,9 @@ def timeless(result: CheckResult) -> dict[str, Any]:
 
     def without(value: Any) -> Any:
         if isinstance(value, dict):
-            return {name: without(inner) for name, inner in value.items() if name not in ("seconds", "run")}
+            return {
+                name: without(inner) for name, inner in value.items() if name not in ("seconds", "run", "command_line")
+            }
         return [without(inner) for inner in value] if isinstance(value, list) else value
 
     cleaned: dict[str, Any] = without(result.to_dict())

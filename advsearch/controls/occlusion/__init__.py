@@ -22,7 +22,18 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.occlusion import silhouettes
-from advsearch.extend import Choice, Control, InputError, Parameter, SceneDescription, Value, Values, geometry, parts
+from advsearch.extend import (
+    Choice,
+    Control,
+    InputError,
+    Parameter,
+    SceneDescription,
+    Value,
+    Values,
+    assets,
+    geometry,
+    parts,
+)
 
 _moving = partial(Parameter.moving, Parameter.ORBIT)
 
@@ -35,21 +46,21 @@ CLEARANCE = 0.05  # smallest distance in object sizes between the camera and the
 
 
 @cache
-def loaded(spec: str) -> parts.ObjectAsset:
+def loaded(spec: str) -> assets.ObjectAsset:
     """Return a bundled object or one from a mesh file, its largest extent 1, centred on the origin. Raises InputError
     where there is no such object, or the file cannot be used."""
     asset = SceneDescription.load_object(spec)
-    mesh = parts.normalised(asset.mesh)
+    mesh = assets.normalised(asset.mesh)
     middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2.0
     return replace(asset, mesh=replace(mesh, vertices=(mesh.vertices - middle).astype(np.float32)))
 
 
-def _asset(option: str) -> parts.ObjectAsset:
+def _asset(option: str) -> assets.ObjectAsset:
     return made(option) if option in MADE else loaded(option)
 
 
 @cache
-def made(name: str) -> parts.ObjectAsset:
+def made(name: str) -> assets.ObjectAsset:
     """Return one of the occluders made here, one object size large around the origin: "card" or "sphere"."""
     generator = np.random.Generator(np.random.PCG64(7))
     if name == "card":
@@ -58,17 +69,17 @@ def made(name: str) -> parts.ObjectAsset:
         uvs = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32)
         vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1).astype(np.float32)
         normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
-        card = parts.Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
-        return parts.ObjectAsset(name, card, texels.clip(0.0, 1.0).astype(np.float32), parts.Material(roughness=0.9))
+        card = assets.Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
+        return assets.ObjectAsset(name, card, texels.clip(0.0, 1.0).astype(np.float32), assets.Material(roughness=0.9))
     grey = np.full((4, 4, 3), 0.5, dtype=np.float32)
-    return parts.ObjectAsset(name, parts.sphere(24, 48), grey, parts.Material(roughness=0.6))
+    return assets.ObjectAsset(name, parts.sphere(24, 48), grey, assets.Material(roughness=0.6))
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
     """Where an occluder goes, in the camera's coordinates; lengths are in object sizes."""
 
-    axes: parts.Doubles  # (3, 3) rows: right, up and forward of a camera that looks at the middle of what is seen
+    axes: assets.Doubles  # (3, 3) rows: right, up and forward of a camera that looks at the middle of what is seen
     angle: float  # from that middle to the occluder, radians
     size: float  # made smaller where it would not fit
     distance: float  # from the camera, changed where it would not fit
@@ -184,10 +195,10 @@ class _Seen:
     """The object as the camera sees it."""
 
     directions: (
-        parts.Doubles | None
+        assets.Doubles | None
     )  # (N, 3) in which it is seen, each for the same area; None if it is not in the picture
-    shown: parts.Doubles  # (M, 3) directions spread over the whole picture
-    rim: parts.Doubles  # (K, 3) those at its edge
+    shown: assets.Doubles  # (M, 3) directions spread over the whole picture
+    rim: assets.Doubles  # (K, 3) those at its edge
     near: float  # distance of its nearest vertex from the camera
     far: float  # distance of the middle of its bounding box
 
@@ -216,7 +227,9 @@ class _Seen:
         return _Seen(directions, shown, rim, near, far)
 
 
-def _through(model: geometry.CameraModel, points: parts.Doubles, faces: npt.NDArray[np.uint32]) -> parts.Doubles | None:
+def _through(
+    model: geometry.CameraModel, points: assets.Doubles, faces: npt.NDArray[np.uint32]
+) -> assets.Doubles | None:
     """Unit directions (N, 3) in which a mesh, with vertices (V, 3) in camera coordinates, is seen through a lens, each
     for the same area of the picture, or None."""
     axes = silhouettes.middle_axes(points / np.linalg.norm(points, axis=1, keepdims=True))
@@ -236,7 +249,7 @@ def _through(model: geometry.CameraModel, points: parts.Doubles, faces: npt.NDAr
 
 def _looked(
     model: geometry.CameraModel, across: tuple[float, float], down: tuple[float, float], count: int
-) -> parts.Doubles:
+) -> assets.Doubles:
     """Unit directions (N, 3) in which a lens sees a part of the picture: as `Silhouette.directions`, in it."""
     row, column = np.divmod(np.arange(count * count), count)
     number = np.arange(count * count)
@@ -249,14 +262,14 @@ def _looked(
     return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
-def _numpy(inputs: Mapping[str, Tensor], name: str, otherwise: parts.Doubles) -> parts.Doubles:
+def _numpy(inputs: Mapping[str, Tensor], name: str, otherwise: assets.Doubles) -> assets.Doubles:
     return inputs[name].detach().double().cpu().numpy() if name in inputs else otherwise
 
 
 # ---- where the occluder goes ----------------------------------------------------------------------------------------
 
 
-def _fitting(points: parts.Doubles, size: float, distance: float, near: float) -> tuple[float, float]:
+def _fitting(points: assets.Doubles, size: float, distance: float, near: float) -> tuple[float, float]:
     """Return a size and a distance close to those asked for with which an occluder with points (V, 3), one object size
     large around the origin, is between the camera and the object, whose nearest vertex is at `near`. It keeps
     `CLEARANCE` from the camera, and no vertex is farther from the camera than the object's nearest one. Where its size

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from advsearch.extend import geometry, images, parts
+from advsearch.extend import assets, geometry, images
 
 RASTER = 128  # pixels along the longer side of a silhouette
 SCAN = 48  # angles at which the coverage is looked up before the crossing is narrowed down
@@ -31,7 +31,7 @@ class Silhouette:
     mask: NDArray[np.bool_]
     window: geometry.Frame
 
-    def directions(self) -> parts.Doubles:
+    def directions(self) -> assets.Doubles:
         """Unit directions (N, 3), one in each covered pixel; all stand for the same area of the picture. Their places
         within pixels are a low-discrepancy sequence (Roberts 2018), or an upright edge would hide whole columns."""
         row, column = np.nonzero(self.mask)
@@ -41,7 +41,7 @@ class Silhouette:
         y = window.low + (row + (0.5 + 0.5698403 * number) % 1.0) * (window.high - window.low) / height
         return _unit(np.stack([x, y, np.ones_like(x)], axis=-1))
 
-    def contains(self, x: parts.Doubles, y: parts.Doubles, forwards: parts.Doubles) -> NDArray[np.bool_]:
+    def contains(self, x: assets.Doubles, y: assets.Doubles, forwards: assets.Doubles) -> NDArray[np.bool_]:
         """Whether directions, any shape and length, lie in the silhouette."""
         height, width = self.mask.shape
         depth = np.maximum(forwards, geometry.NEAREST)
@@ -53,7 +53,7 @@ class Silhouette:
 
 
 def silhouette(
-    points: parts.Doubles, faces: NDArray[np.uint32], frame: geometry.Frame | None = None
+    points: assets.Doubles, faces: NDArray[np.uint32], frame: geometry.Frame | None = None
 ) -> Silhouette | None:
     """Rasterise a mesh with vertices (V, 3) in camera coordinates as the camera sees it within a frame, None for all in
     front; faces (F, 3) that reach behind the camera are left out. None if nothing is seen of it."""
@@ -81,12 +81,12 @@ def silhouette(
 class Passage:
     """A thing that moves sideways past another, both as the camera sees them."""
 
-    hidden: parts.Doubles  # directions (N, 3) in which what is to be hidden is seen
+    hidden: assets.Doubles  # directions (N, 3) in which what is to be hidden is seen
     cover: Silhouette  # of the moving thing, straight ahead of the camera
-    axes: parts.Doubles  # (3, 3) rows: where its right, up and forward point when it is in the middle of the other
+    axes: assets.Doubles  # (3, 3) rows: where its right, up and forward point when it is in the middle of the other
     direction: float  # from which side it comes: degrees, 0 from the right of the picture, 90 from above
 
-    def coverage(self, angles: parts.Doubles) -> parts.Doubles:
+    def coverage(self, angles: assets.Doubles) -> assets.Doubles:
         """Return the hidden share (K,) at angles (K,) in radians away from the middle."""
         turn = math.radians(self.direction)
         right, up, forward = (self.hidden @ self.axes.T).T
@@ -121,12 +121,12 @@ class Passage:
         return 0.5 * (out + within)
 
 
-def spread_directions(frame: geometry.Frame) -> parts.Doubles:
+def spread_directions(frame: geometry.Frame) -> assets.Doubles:
     """Return unit directions (N, 3) that stand for all that a frame shows."""
     return Silhouette(np.ones((GRID, GRID), dtype=np.bool_), frame).directions()
 
 
-def middle_axes(hidden: parts.Doubles) -> parts.Doubles:
+def middle_axes(hidden: assets.Doubles) -> assets.Doubles:
     """Return a camera's axes (3, 3) turned to look at the middle of a silhouette: rows right, up, forward."""
     forward = hidden.mean(axis=0)
     forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
@@ -136,7 +136,7 @@ def middle_axes(hidden: parts.Doubles) -> parts.Doubles:
 
 
 def angle_outside(
-    shown: parts.Doubles, rim: parts.Doubles, cover: Silhouette, axes: parts.Doubles, direction: float
+    shown: assets.Doubles, rim: assets.Doubles, cover: Silhouette, axes: assets.Doubles, direction: float
 ) -> float:
     """Return the angle in radians beyond which a thing that comes from a direction, degrees, is out of the picture on
     its side: of directions (N, 3) spread over the whole picture and (M, 3) at its edge; the others as of `Passage`."""
@@ -148,5 +148,5 @@ def angle_outside(
     return float(angles[max(int(inside[0]) - 1, 0)]) if len(inside) else float(angles[0])
 
 
-def _unit(vectors: parts.Doubles) -> parts.Doubles:
+def _unit(vectors: assets.Doubles) -> assets.Doubles:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

@@ -43,9 +43,9 @@ from advsearch.extend import (
     SceneDescription,
     Value,
     Values,
+    assets,
     errors,
     geometry,
-    parts,
     stored_files,
 )
 
@@ -462,14 +462,14 @@ def measure_tilt(rotations: Rotation) -> float:
     return math.degrees(math.acos(float(np.clip(upwards.mean(), -1.0, 1.0))))
 
 
-def align_quaternions(quaternions: parts.Doubles) -> parts.Doubles:
+def align_quaternions(quaternions: assets.Doubles) -> assets.Doubles:
     """Return quaternions (n, 4) with signs such that each is nearer to the one before than its opposite is."""
     turns_back = (quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0.0
     signs = np.where(np.cumsum(np.concatenate([[False], turns_back])) % 2, -1.0, 1.0)
     return np.asarray(quaternions * signs[:, None])
 
 
-def check_times(path: Path, times: parts.Doubles) -> None:
+def check_times(path: Path, times: assets.Doubles) -> None:
     """Raise FileFormatError: times (n,) from the first on are too few or many, or do not ascend within limits."""
     if not 2 <= len(times) <= MOST_WAYPOINTS:
         raise errors.FileFormatError(f"{path}: expected 2 to {MOST_WAYPOINTS} waypoints, got {len(times)}")
@@ -486,7 +486,7 @@ def turned(start: Start, shift: Tensor, heading: Tensor) -> Tensor:
     return posed
 
 
-def the_shorter_way(degrees: parts.Doubles) -> tuple[parts.Doubles, str | None]:
+def the_shorter_way(degrees: assets.Doubles) -> tuple[assets.Doubles, str | None]:
     """Return headings (n,) so that one goes to the next the shorter way round, and what is said of it.
 
     Only where all are within one turn, from 0 to 360 or from -180 to 180: others count on, as 0 to 360 does for a whole

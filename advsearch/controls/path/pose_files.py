@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from advsearch.extend import errors, parts, reading
+from advsearch.extend import assets, errors, reading
 
 MAX_COLUMNS = 64
 MAX_ROWS = 100_000
@@ -39,7 +39,7 @@ QUATERNION_NAME = re.compile(r"q(?:uat(?:ernion)?)?(?:_\w+)?[._]?([wxyz])|(?:rot
 UNIT = re.compile(r"\[([^\]]*)\]")
 
 OPTICAL, UNUSED = "optical", "none"
-SENSOR_AXES: Mapping[str, parts.Doubles] = {
+SENSOR_AXES: Mapping[str, assets.Doubles] = {
     OPTICAL: np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "flu": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
@@ -55,7 +55,7 @@ AXES_MEAN: Mapping[str, str] = {
     "euroc": "x up, y right, z ahead",
     UNUSED: "not read: the camera looks at the object",
 }
-WORLD_TO_Z_UP: Mapping[str, parts.Doubles] = {
+WORLD_TO_Z_UP: Mapping[str, assets.Doubles] = {
     "z": np.eye(3),
     "-z": np.diag([1.0, -1.0, -1.0]),
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
@@ -77,8 +77,8 @@ class Trajectory:
     """Poses from a file, as they stand in it, but for times in seconds."""
 
     format: PoseFormat
-    times: parts.Doubles | None  # (n,) seconds; None where the file has none
-    positions: parts.Doubles  # (n, 3)
+    times: assets.Doubles | None  # (n,) seconds; None where the file has none
+    positions: assets.Doubles  # (n, 3)
     rotations: Rotation | None  # from the sensor's axes to the world's; None where the file has none
     notes: tuple[str, ...]
 
@@ -86,7 +86,7 @@ class Trajectory:
     def default_up(self) -> str:
         return "-y" if self.format is PoseFormat.KITTI else "z"
 
-    def orient(self, axes: str, up: str, origin: Sequence[float]) -> tuple[parts.Doubles, Rotation | None]:
+    def orient(self, axes: str, up: str, origin: Sequence[float]) -> tuple[assets.Doubles, Rotation | None]:
         """Return positions (n, 3) from an origin, and rotations from a camera's axes (x right, y down, z ahead), both
         in a world whose z is up; no rotations where the axes are `UNUSED` or the file has none."""
         world = Rotation.from_matrix(WORLD_TO_Z_UP[up])
@@ -168,7 +168,7 @@ def _find_columns(names: Sequence[str]) -> dict[str, int]:
     return {} if is_own else columns
 
 
-def _read_table(path: Path, rows: Sequence[Sequence[str]], count: int) -> parts.Doubles:
+def _read_table(path: Path, rows: Sequence[Sequence[str]], count: int) -> assets.Doubles:
     for row in rows:
         if len(row) != count or not all(map(reading.is_number, row)):
             raise errors.FileFormatError(
