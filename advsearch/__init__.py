@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch.catalog import list_built_ins
 from advsearch.registry import EXPERIMENTS, get_experiment
+from advsearch.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from advsearch import controls as controls
@@ -49,7 +50,6 @@ if TYPE_CHECKING:
     from advsearch.tasks import Task as Task
     from advsearch.trust.code import allow_code as allow_code
 
-__version__ = "0.1.0"
 
 _HOMES = {
     "AttackResult": "advsearch.questions.attack.result",

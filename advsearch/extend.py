@@ -11,7 +11,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from advsearch import __version__ as __version__
+from advsearch.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from advsearch import errors as errors

@@ -39,6 +39,7 @@ COMMON = {
     "threads",
     "progress",
     "trust",
+    "version",
 }
 """Small modules, and the room of guards, that anyone may import and that import nobody but each other."""
 

@@ -22,12 +22,13 @@ from dataclasses import asdict, dataclass
 from importlib import metadata, resources
 from pathlib import Path
 
-from advsearch import __version__, threads
+from advsearch import threads
 from advsearch.cli import output
 from advsearch.cli.main import command
 from advsearch.errors import FELL_SHORT, AdvsearchError
 from advsearch.scene.mitsuba_backend import llvm
 from advsearch.trust.code import OWN_FOLDER
+from advsearch.version import __version__
 
 OK, WARNING, MISSING, BROKEN = "ok", "warning", "missing", "broken"
 """The states of a part. A warning does not keep anything from running."""

@@ -17,7 +17,6 @@ from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
-from advsearch import __version__
 from advsearch.catalog import is_present
 from advsearch.cli import output
 from advsearch.cli.output import BAD_INPUT, INTERRUPTED, OK, at_work, end_output, open_descriptors, screens, shortened
@@ -25,6 +24,7 @@ from advsearch.errors import AdvsearchError, CodeNotAllowedError, InputError, Un
 from advsearch.interrupts import INTERRUPTS, end_at_the_second, unless_interrupted
 from advsearch.registry import EXPERIMENTS, get_experiment, get_experiment_help, imported
 from advsearch.trust.code import allow_code, nothing_allowed
+from advsearch.version import __version__
 
 if TYPE_CHECKING:
     from advsearch.experiment import Experiment

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from advsearch.options import Value
-    from advsearch.scene.places.place_file import Place
     from advsearch.scene.settings import Parameter
 
 Floats = npt.NDArray[np.float32]
@@ -162,7 +161,7 @@ class EnvironmentAsset:
     photographed: bool = False  # it shows the floor of a real place: the ground that things stand on is that by itself
     ground: str | None = None  # the kind of ground (`settings.GROUND_KINDS`) that belongs to it; None for the usual one
     candelas: float | None = None  # luminance of a radiance of 1, cd/m2; None where its brightness means nothing
-    place: Place | None = None  # what stands around the object, from a file of the user's
+    place: Any = None  # `parts.Place`: what stands around the object, from a file of the user's
 
     def __post_init__(self) -> None:
         bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)

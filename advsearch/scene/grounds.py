@@ -15,8 +15,8 @@ from torch import Tensor
 from advsearch.scene import settings
 from advsearch.scene.assets import Doubles, EnvironmentAsset, Floats, Mesh
 from advsearch.scene.geometry import camera_to_world, middle
-from advsearch.scene.parts import MeshPart
-from advsearch.scene.places.place_file import Place, lay_place, load_bundled_place
+from advsearch.scene.parts import MeshPart, Place
+from advsearch.scene.places.place_file import lay_place, load_bundled_place
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import lru_cache
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,9 +24,9 @@ from advsearch.scene.assets import (
     Shape,
     pose_of,
 )
-
-if TYPE_CHECKING:
-    from advsearch.scene.places.place_file import Place
+from advsearch.scene.footprint import Footprint as Footprint
+from advsearch.scene.footprint import Solid as Solid
+from advsearch.scene.places.schema import PlaceFile
 
 Triple = tuple[float, float, float]
 BASE_COLOR = "base color"  # the type that stands for the texture in a surface in Mitsuba's words
@@ -48,21 +48,6 @@ class ScenePart:
     volumetric: ClassVar[bool] = False  # needs an integrator that handles media
 
 
-class Footprint(NamedTuple):
-    """What something takes up: its convex outline on the ground, corners (K, 2), and between which heights."""
-
-    outline: Doubles
-    low: float
-    high: float
-
-
-class Solid(NamedTuple):
-    """What nothing else can be in, and what it is called in a sentence: "a house"."""
-
-    name: str
-    footprint: Footprint
-
-
 @dataclass(frozen=True, eq=False)
 class MeshPart(Shape, ScenePart):
     """A shape in the scene; "object" is the object itself.
@@ -82,6 +67,16 @@ class MeshPart(Shape, ScenePart):
     def laid(self) -> bool:
         """Whether it belongs to the ground that the scene has by itself."""
         return self.place is not None
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A place with one of its variants."""
+
+    name: str
+    file: PlaceFile
+    parts: tuple[MeshPart, ...]  # in metres; what they emit is in cd/m2
+    notes: tuple[str, ...] = ()  # what was left out, one sentence each
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,12 +15,12 @@ from importlib import resources
 from pathlib import Path
 from urllib.parse import quote
 
-from advsearch import __version__
 from advsearch.files import MESHES
 from advsearch.report import wording
 from advsearch.report.views import Html, element, join_html
 from advsearch.runs.directory import PARTS, REPORT
 from advsearch.trust import pages
+from advsearch.version import __version__
 
 MOST_NOTES = 3  # notes on files that are not folded
 

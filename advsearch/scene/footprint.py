@@ -1,0 +1,22 @@
+"""What things take up: outlines on the ground, from a height to another one."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from advsearch.scene.assets import Doubles
+
+
+class Footprint(NamedTuple):
+    """What something takes up: its convex outline on the ground, corners (K, 2), and between which heights."""
+
+    outline: Doubles
+    low: float
+    high: float
+
+
+class Solid(NamedTuple):
+    """What nothing else can be in, and what it is called in a sentence: "a house"."""
+
+    name: str
+    footprint: Footprint

@@ -1,0 +1,104 @@
+"""The entries of the YAML file of a place, see `place_file`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from advsearch.scene.footprint import Footprint
+
+MOST_SOLIDS = 2000  # outlines of a place
+CORNERS = 8  # of the outline of what is round
+FARTHEST = 1e5  # largest length, metres
+
+Length = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, le=FARTHEST, allow_inf_nan=False)]
+Luminance = Annotated[float, Field(ge=0.0, le=1e9, allow_inf_nan=False)]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Bounds = tuple[Length, Length]
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SolidEntry(_Entry):
+    """What nothing else can be in: a convex outline on the ground, or a round one at some positions."""
+
+    name: Name  # as a sentence has it: "a house"
+    outline: Annotated[list[tuple[Length, Length]], Field(min_length=3, max_length=64)] | None = None
+    at: Annotated[list[tuple[Length, Length]], Field(min_length=1, max_length=MOST_SOLIDS)] | None = None
+    radius: Positive | None = None
+    heights: Bounds  # from and to
+
+    @model_validator(mode="after")
+    def _check_form(self) -> SolidEntry:
+        is_round = self.at is not None and self.radius is not None
+        if is_round == (self.outline is not None) or (self.at is None) != (self.radius is None):
+            raise ValueError("expected either an outline, or a radius and the positions that it is at")
+        if self.heights[0] >= self.heights[1]:
+            raise ValueError("heights: expected the lower one first")
+        return self
+
+    def list_footprints(self) -> list[Footprint]:
+        """Return the outlines, in metres."""
+        if self.outline is not None:
+            return [Footprint(np.array(self.outline), *self.heights)]
+        turn = np.arange(CORNERS) * (2.0 * np.pi / CORNERS)
+        circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        return [Footprint(np.array(center) + (self.radius or 0.0) * circle, *self.heights) for center in self.at or ()]
+
+
+class ValidEntry(_Entry):
+    """The box in which a camera has to be; what is not bounded is left out."""
+
+    x: Bounds | None = None
+    y: Bounds | None = None
+    z: Bounds | None = None
+
+    @model_validator(mode="after")
+    def _check_order(self) -> ValidEntry:
+        for axis, bounds in (("x", self.x), ("y", self.y), ("z", self.z)):
+            if bounds is not None and bounds[0] >= bounds[1]:
+                raise ValueError(f"{axis}: expected the lower bound first")
+        return self
+
+
+class PictureEntry(_Entry):
+    """What stands around, where the maps of the light show it: it fits the ground from near that place only."""
+
+    height: Positive  # above the ground from which the maps were taken
+    x: Bounds  # from and to, of what stands nearest
+    y: Bounds
+
+    @model_validator(mode="after")
+    def _check_inside(self) -> PictureEntry:
+        for axis, (low, high) in (("x", self.x), ("y", self.y)):
+            if not low < 0.0 < high:
+                raise ValueError(f"{axis}: expected bounds on both sides of the object, at 0")
+        return self
+
+
+class LightEntry(_Entry):
+    """A light that the place may stand in."""
+
+    map: Name  # an .hdr or .exr file in the folder, or the name of a bundled environment
+    lux: Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)] | None = None  # of level ground under open sky
+    variant: Name | None = None  # of the materials
+
+
+class PlaceFile(_Entry):
+    """What a place's file says."""
+
+    mesh: Name  # a .glb or .gltf file in the folder
+    ground: Annotated[list[Name], Field(min_length=1, max_length=64)]  # meshes that things stand on
+    lights: Annotated[dict[Name, LightEntry], Field(min_length=1, max_length=64)]  # the first is taken by itself
+    lane_width: Positive | None = None  # of the lane that the object drives in; None: there is none
+    floor: Length = 0.0  # height of the floor that cameras stand on, where the object stands on something
+    lamps: Annotated[dict[Name, tuple[Luminance, Luminance, Luminance]], Field(max_length=64)] = {}
+    """Luminance in cd/m2, for each colour channel, of meshes that shine when it is dark, and only then."""
+    solids: Annotated[list[SolidEntry], Field(max_length=MOST_SOLIDS)] = []
+    valid: ValidEntry = ValidEntry()
+    picture: PictureEntry | None = None  # None: nothing near is in the maps alone
