@@ -119,7 +119,8 @@ def test_an_objective_of_another_package_may_destroy_what_it_gets(monkeypatch: p
         return objective
 
     kind = ObjectiveKind("destroying", "it destroys", "none", task=None, of_task=made)
-    monkeypatch.setitem(OBJECTIVE_KINDS._installed, kind.name, kind)
+    entry_point: Any = SimpleNamespace(value="elsewhere:KIND", load=lambda: kind)
+    monkeypatch.setitem(OBJECTIVE_KINDS._installed, kind.name, entry_point)
     output, images = LOGITS.clone(), PICTURES.clone()
     assert torch.equal(get_objective("destroying", TASK)(output, images, (0,)), LOGITS[:, 1])
     assert torch.equal(output, LOGITS) and torch.equal(images, PICTURES)

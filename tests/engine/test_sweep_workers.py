@@ -73,7 +73,7 @@ def rows(path: Path) -> list[Any]:
 
 
 def summary(result: Any) -> dict[str, Any]:
-    times = ("seconds", "run", "renders_per_second", "shared", "warnings")
+    times = ("seconds", "run", "renders_per_second", "shared", "warnings", "command_line")
     return {name: value for name, value in result.summary.to_dict().items() if name not in times}
 
 
