@@ -399,7 +399,7 @@ def _mappings_from_texts(config: type[Config], data: Mapping[str, Any]) -> dict[
         for name in {setting.name, setting.field} & values.keys():
             value = values[name]
             texts = [value] if isinstance(value, str) else value
-            if isinstance(texts, (list, tuple)) and texts and all(isinstance(text, str) for text in texts):
+            if isinstance(texts, (list, tuple)) and all(isinstance(text, str) for text in texts):
                 try:
                     values[name] = setting.read_texts(texts, setting.name)
                 except ValueError:
