@@ -183,6 +183,18 @@ WRONG: list[tuple[dict[str, object], type[InputError], str]] = [
     ({"lane_width": float("inf")}, FileFormatError, r"lane_width: Input should be"),
     ({"solids": [{"name": "a wall", "heights": [0, 1]}]}, FileFormatError, r"solids.0: expected either an outline"),
     ({"solids": [{"name": "a wall", "at": [[0, 0]], "radius": 1, "heights": [2, 1]}]}, FileFormatError, r"heights"),
+    ({"lane_width": True}, FileFormatError, r"lane_width: Input should be a valid number"),
+    ({"lane_width": "3.5"}, FileFormatError, r"lane_width: Input should be a valid number"),
+    ({"red\nhouse": 1}, FileFormatError, r"place.yaml: red\\nhouse: Extra inputs"),
+    ({"lights": {"day": {"map": "black.exr", "lux": 5}}}, InputError, r"lights.day: expected a map with light for its"),
+    *[
+        ({"solids": [{"name": name, "outline": outline, "heights": [0, 1]}]}, FileFormatError, message)
+        for name, outline, message in (
+            ("a\nwall", [[0, 0], [1, 0], [1, 1]], r"solids.0: name: expected a line of text"),
+            ("a wall", [[0, 0], [1, 0], [2, 0]], r"solids.0: outline: expected the corners of a convex outline"),
+            ("a wall", [[0, 0], [4, 0], [4, 4], [2, 1], [0, 4]], r"outline: expected the corners of a convex"),
+        )
+    ],
 ]  # fmt: skip
 
 
@@ -194,6 +206,7 @@ def test_a_file_that_says_something_else_is_refused_with_a_reason(
     outside.write_bytes((street.parent / "street.glb").read_bytes())
     (street.parent / "link.glb").symlink_to(outside)
     os.mkfifo(street.parent / "pipe.glb")
+    (street.parent / "black.exr").write_bytes(exr(np.zeros((16, 32, 3), np.float32)))
     write(street, **changes)
     with pytest.raises(error, match=message):
         describe("car", street)
