@@ -62,8 +62,8 @@ def export(args: argparse.Namespace) -> int:
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     usable = EXPORTERS.list_usable()
     suffixes = {table: table for table in FORMATS}
-    for name, exporter in usable.items():
-        suffixes.setdefault(exporter.suffix or name, name)  # a package takes none of ours
+    for name, usable_exporter in usable.items():
+        suffixes.setdefault(usable_exporter.suffix or name, name)  # a package takes none of ours
     format = args.format or suffixes.get(by_name, by_name)
     if format == "fiftyone":
         raise InputError("--format: fiftyone was removed, since FiftyOne reads COCO; use --format coco")
