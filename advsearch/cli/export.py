@@ -61,7 +61,9 @@ def export(args: argparse.Namespace) -> int:
     out = None if args.out is None else Path(args.out)
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     usable = EXPORTERS.list_usable()
-    suffixes = {exporter.suffix or name: name for name, exporter in usable.items()}
+    suffixes = {table: table for table in FORMATS}
+    for name, usable_exporter in usable.items():
+        suffixes.setdefault(usable_exporter.suffix or name, name)  # a package takes none of ours
     format = args.format or suffixes.get(by_name, by_name)
     if format == "fiftyone":
         raise InputError("--format: fiftyone was removed, since FiftyOne reads COCO; use --format coco")
@@ -71,7 +73,7 @@ def export(args: argparse.Namespace) -> int:
         owners = [name for name, exporter in usable.items() if option in exporter.options]
         if format not in owners and getattr(args, option) is not None:
             raise InputError(f"--{option}: belongs to --format {' and '.join(owners)}; leave it out")
-    if format not in EXPORTERS:
+    if format in FORMATS or format not in EXPORTERS:
         return _table(args, out, by_name)
     exporter = EXPORTERS[format]()
     if out is None:

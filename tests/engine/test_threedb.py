@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import runpy
+from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,7 +15,9 @@ from stored_sweeps import make_sweep
 from advsearch.cli.exporters.threedb import write_threedb
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError
+from advsearch.progress import Progress
 from advsearch.questions.sweep.result import import_threedb
+from advsearch.runs.exporters import EXPORTERS, Exported, Exporter
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.viewer.thumbnails import kept_pictures
 
@@ -58,6 +62,30 @@ def test_a_sweep_is_written_as_its_dashboard_reads_it(tmp_path: Path, capsys: py
         assert (out / "images" / f"{line['id']}_rgb.png").is_file() == (not row.correct)
     assert main(["export", str(run), "--format", "3db", "--out", str(out)]) == 2
     assert "not empty" in capsys.readouterr().err
+
+
+def test_an_exporter_of_a_package_takes_no_name_of_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is there by its own name, and neither a table nor what a file's ending stands for becomes its."""
+
+    class Greedy(Exporter):
+        writes = "a text file"
+        suffix = "glb"
+
+        def write(self, run: str, out: Path, options: Mapping[str, Any], progress: Progress) -> Exported:
+            out.write_text("greedy")
+            return Exported({}, "done")
+
+    for name in ("csv", "greedy"):
+        exporter = type("Named", (Greedy,), {"name": name})
+        monkeypatch.setitem(EXPORTERS._installed, name, SimpleNamespace(value="x:X", load=lambda one=exporter: one))
+    run = str(make_sweep(tmp_path / "run", keep="wrong"))
+    table, asked, mesh, own = (tmp_path / name for name in ("rows.csv", "rows.txt", "mug.glb", "own.txt"))
+    assert main(["export", run, "--out", str(table)]) == 0
+    assert main(["export", run, "--format", "csv", "--out", str(asked)]) == 0
+    assert table.read_text() == asked.read_text() != "greedy"
+    assert main(["export", run, "--out", str(mesh)]) == 2 and not mesh.exists()  # as glTF, which a sweep has not
+    assert main(["export", run, "--format", "greedy", "--out", str(own)]) == 0
+    assert own.read_text() == "greedy"
 
 
 def test_3dbs_own_dashboard_opens_what_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from advsearch.scene.geometry import standing
 from advsearch.scene.glb import glb
 from advsearch.scene.grounds import LUMINANCE, enclosed, has_lanes, irradiance, past, paved, surroundings_of, view_of
 from advsearch.scene.library import import_environment, load_environment
+from advsearch.scene.places import place_meshes
 from advsearch.scene.places.place_file import is_place_file, load_bundled_place, read_place_file, split_light
 from scenes.files import exr
 from scenes.places import PLACES
@@ -180,6 +183,18 @@ WRONG: list[tuple[dict[str, object], type[InputError], str]] = [
     ({"lane_width": float("inf")}, FileFormatError, r"lane_width: Input should be"),
     ({"solids": [{"name": "a wall", "heights": [0, 1]}]}, FileFormatError, r"solids.0: expected either an outline"),
     ({"solids": [{"name": "a wall", "at": [[0, 0]], "radius": 1, "heights": [2, 1]}]}, FileFormatError, r"heights"),
+    ({"lane_width": True}, FileFormatError, r"lane_width: Input should be a valid number"),
+    ({"lane_width": "3.5"}, FileFormatError, r"lane_width: Input should be a valid number"),
+    ({"red\nhouse": 1}, FileFormatError, r"place.yaml: red\\nhouse: Extra inputs"),
+    ({"lights": {"day": {"map": "black.exr", "lux": 5}}}, InputError, r"lights.day: expected a map with light for its"),
+    *[
+        ({"solids": [{"name": name, "outline": outline, "heights": [0, 1]}]}, FileFormatError, message)
+        for name, outline, message in (
+            ("a\nwall", [[0, 0], [1, 0], [1, 1]], r"solids.0: name: expected a line of text"),
+            ("a wall", [[0, 0], [1, 0], [2, 0]], r"solids.0: outline: expected the corners of a convex outline"),
+            ("a wall", [[0, 0], [4, 0], [4, 4], [2, 1], [0, 4]], r"outline: expected the corners of a convex"),
+        )
+    ],
 ]  # fmt: skip
 
 
@@ -191,6 +206,7 @@ def test_a_file_that_says_something_else_is_refused_with_a_reason(
     outside.write_bytes((street.parent / "street.glb").read_bytes())
     (street.parent / "link.glb").symlink_to(outside)
     os.mkfifo(street.parent / "pipe.glb")
+    (street.parent / "black.exr").write_bytes(exr(np.zeros((16, 32, 3), np.float32)))
     write(street, **changes)
     with pytest.raises(error, match=message):
         describe("car", street)
@@ -276,21 +292,67 @@ def test_a_variant_keeps_the_name_of_what_it_changes_as_a_whole(street: Path) ->
     assert (snow["snow"].mesh.normals[:, 2] == 1.0).all() and snow["snow"].base_color.max() > 0.89
 
 
-def test_what_a_place_has_not_is_said(street: Path) -> None:
-    mesh = street.parent / "street.glb"
+def rewrite_header(mesh: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Change the header of a binary glTF file."""
     data = mesh.read_bytes()
     (length,) = struct.unpack_from("<12xI", data)
     header, rest = json.loads(data[20 : 20 + length]), data[20 + length :]
-    corners = header["meshes"][0]["primitives"][0]["attributes"]
-    corners["COLOR_0"] = corners["NORMAL"]
-    header["animations"] = [{"channels": [], "samplers": []}]
-    header["nodes"].append({"extensions": {"KHR_lights_punctual": {"light": 0}}})
-    header["scenes"][0]["nodes"].append(len(header["nodes"]) - 1)
-    header["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
+    change(header)
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
     body = struct.pack("<I4s", len(text), b"JSON") + text + rest
     mesh.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+
+
+def paint_road(street: Path, materials: int, factor: float, nearest: bool = False) -> None:
+    """Give the road as many materials that share one picture of 8 x 8, each with a piece of its own."""
+    road = box("road", (-40, -8, -0.5), (40, 8, 0), 0.3).mesh
+    looks = {f"look {number}": Look(np.full((8, 8, 3), 0.5, np.float32), Material()) for number in range(materials)}
+    looks = {"road": looks["look 0"], **looks}
+    file = PlaceModel(looks, [Node([Primitive(road, name)]) for name in looks], {})
+    mesh = street.parent / "street.glb"
+    mesh.write_bytes(write_glb(file))
+
+    def share(header: dict[str, Any]) -> None:
+        for material in header["materials"]:
+            surface = material["pbrMetallicRoughness"]
+            surface["baseColorTexture"]["index"] = 0
+            surface["baseColorFactor"] = [factor, factor, factor, 1.0]
+        header["samplers"][0]["magFilter"] = 9728 if nearest else 9729
+
+    rewrite_header(mesh, share)
+    write(street, lamps={})
+
+
+def test_a_picture_that_many_materials_share_is_counted_for_each(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A picture of few bytes must not become gigabytes of textures, each with a color of its own."""
+    monkeypatch.setattr(place_meshes, "MOST_TEXELS", 1000)
+    paint_road(street, 10, 0.5)
+    assert len(describe("car", street).around) == 11
+    paint_road(street, 20, 0.5)
+    with pytest.raises(FileFormatError, match=r"street.glb: expected textures of at most 1,000 texels, counted for"):
+        describe("car", street)
+    paint_road(street, place_meshes.MOST_MESHES, 0.5)
+    with pytest.raises(InputError, match=r"expected at most 200 materials, got 201"):
+        describe("car", street)
+
+
+def test_a_texture_of_sharp_texels_is_enlarged_no_further_than_that_of_an_object(street: Path) -> None:
+    paint_road(street, 1, 1.0, nearest=True)
+    assert describe("car", street).around["road"].base_color.shape == (512, 512, 3)
+
+
+def test_what_a_place_has_not_is_said(street: Path) -> None:
+
+    def add(header: dict[str, Any]) -> None:
+        corners = header["meshes"][0]["primitives"][0]["attributes"]
+        corners["COLOR_0"] = corners["NORMAL"]
+        header["animations"] = [{"channels": [], "samplers": []}]
+        header["nodes"].append({"extensions": {"KHR_lights_punctual": {"light": 0}}})
+        header["scenes"][0]["nodes"].append(len(header["nodes"]) - 1)
+        header["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
+
+    rewrite_header(street.parent / "street.glb", add)
     notes = describe("car", street).notes
     for word in ("colours of vertices", "skins or animations", "has lights"):
         assert sum(word in note for note in notes) == 1, notes

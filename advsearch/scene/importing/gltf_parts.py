@@ -38,7 +38,7 @@ from advsearch.scene.importing.parts import (
     unit,
     with_opacity,
 )
-from advsearch.scene.importing.pictures import FilePictures, Kind
+from advsearch.scene.importing.pictures import TEXTURE_LIMIT, FilePictures, Kind
 from advsearch.scene.importing.texture import mean_over
 from advsearch.scene.importing.unread import TrackedKeys
 from advsearch.scene.skeleton import Movable, Target
@@ -257,7 +257,7 @@ class GltfSurfaces:
         texels = self._pictures.read((entry.uri, entry.bufferView), content, kind, name, words)
         if texels is None or self._sampler(use).magFilter != gltf_entries.NEAREST or texels.shape[:2] == (1, 1):
             return texels
-        sharp = self._pictures.side // 2  # so many that filtering does not show
+        sharp = min(self._pictures.side, TEXTURE_LIMIT) // 2  # so many that filtering does not show
         times = sharp // max(texels.shape[:2])
         if times < 2:
             self.notes.say(BLURRED.format(most=sharp // 2))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from advsearch.errors import UnknownNameError
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.grounds import LUMINANCE, irradiance
 from advsearch.scene.importing.files import safe_name
@@ -39,7 +39,12 @@ def import_place(spec: str) -> EnvironmentAsset:
     candelas = None
     if light.lux is not None:
         arriving = irradiance(torch.from_numpy(lit.radiance.copy())) @ torch.tensor(LUMINANCE)
-        candelas = light.lux / max(float(arriving), 1e-30)
+        if float(arriving) <= 0.0:
+            raise InputError(
+                f"{path}: lights.{light_name}: expected a map with light for its lux, got {light.map}, which is black "
+                "where the sky is; leave lux out"
+            )
+        candelas = light.lux / float(arriving)
     return replace(
         lit,
         name=place.name if chosen is None else safe_name(Path(f"{place.name}-{light_name}.x")),

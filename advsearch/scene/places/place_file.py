@@ -27,7 +27,7 @@ from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError, UnknownNameError
 from advsearch.scene.footprint import Footprint, Solid
-from advsearch.scene.importing.files import safe_name
+from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.parts import MeshPart, Place
 from advsearch.scene.places.place_meshes import read_place_meshes
 from advsearch.scene.places.schema import PlaceFile
@@ -62,7 +62,7 @@ def read_place_file(path: Path) -> PlaceFile:
         return PlaceFile.model_validate(content)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(map(str, first["loc"]))[:80]
+        where = shown(".".join(map(str, first["loc"])), quoted=False)
         problem = first["msg"].removeprefix("Value error, ")[:200]
         raise FileFormatError(f"{path}: {where or 'the file'}: {problem}; docs/scenes.md has an example") from None
 

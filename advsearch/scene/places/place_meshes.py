@@ -26,13 +26,17 @@ from advsearch.scene.importing.gltf import GltfFile
 from advsearch.scene.importing.gltf_entries import Entry, Header, Index, MaterialEntry, Primitive
 from advsearch.scene.importing.gltf_parts import GltfSurfaces, Piece, left_out, read_piece
 from advsearch.scene.importing.parts import NEUTRAL, ImportedPart, ImportedSurface, placed
+from advsearch.scene.importing.pictures import LARGEST_SUM
 from advsearch.scene.importing.readers import read_mesh_bytes
 from advsearch.scene.importing.scenes import TAKEN
 from advsearch.scene.parts import BASE_COLOR, MeshPart
+from advsearch.trust.stored_files import check_most
 
 SUFFIXES = (".glb", ".gltf")
 TEXTURE_LIMIT = 8192  # longest side of a texture; a facade is larger than what an object wears
 MOST_MESHES = 200
+MOST_TEXELS = 2 * LARGEST_SUM
+"""Of all materials: a picture that many of them share is small in the file, and a texture of each in memory."""
 REFLECTANCE = 0.08  # of a surface of specular 1 that faces the light
 DULL_COAT, GLOSSY_COAT = 0.1, 0.001  # width of the lobe of Mitsuba's clear coat, of gloss 0 and 1
 VARIANTS = "KHR_materials_variants"
@@ -139,8 +143,7 @@ def read_place_meshes(path: Path, variant: str | None) -> tuple[list[MeshPart], 
     groups = _group_by_material(header, drawn)
     if not groups:
         raise FileFormatError(f"{path}: expected meshes with faces, got none; export triangles")
-    if len(groups) > MOST_MESHES:
-        raise InputError(f"{path}: expected at most {MOST_MESHES} materials, got {len(groups)}; join some of them")
+    _check_materials(path, len(groups))
     names, parts = Names(TAKEN), list[MeshPart]()
     for (name, material), members in groups.items():
         part = _make_part(path, names.free(name), members, surfaces[material])
@@ -197,8 +200,14 @@ def _read_primitives(
     by_material: dict[int | None, list[Piece]] = {}
     for piece in pieces.values():
         by_material.setdefault(piece.material, []).append(piece)
+    _check_materials(path, len(by_material))
     readers = GltfSurfaces(file, notes, TEXTURE_LIMIT)
-    fitted = {material: readers.surface(material, members) for material, members in by_material.items()}
+    fitted: dict[int | None, tuple[ImportedSurface, Doubles, Doubles]] = {}
+    texels = 0
+    for material, members in by_material.items():
+        fitted[material] = readers.surface(material, members)
+        texels += _count_texels(fitted[material][0])
+        check_most(path, texels, MOST_TEXELS, "textures of at most {} texels, counted for each material")
     drawn: list[DrawnPrimitive] = []
     for mesh, pose in drawn_meshes:
         for number, primitive in enumerate(header.meshes[mesh].primitives):
@@ -212,6 +221,16 @@ def _read_primitives(
             part = placed(replace(piece.part, uvs=uvs), pose)
             drawn.append(DrawnPrimitive(primitive.material, piece.material, part))
     return drawn, {material: surface for material, (surface, _, _) in fitted.items()}
+
+
+def _check_materials(path: Path, count: int) -> None:
+    if count > MOST_MESHES:
+        raise InputError(f"{path}: expected at most {MOST_MESHES} materials, got {count}; join some of them")
+
+
+def _count_texels(surface: ImportedSurface) -> int:
+    held = (surface.texture, surface.normal_map, surface.emission)
+    return sum(texels.shape[0] * texels.shape[1] for texels in held if texels is not None)
 
 
 def _group_by_material(header: Header, drawn: Sequence[DrawnPrimitive]) -> dict[NameAndMaterial, list[ImportedPart]]:

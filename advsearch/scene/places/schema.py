@@ -7,21 +7,33 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from advsearch.scene.assets import Doubles
 from advsearch.scene.footprint import Footprint
 
 MOST_SOLIDS = 2000  # outlines of a place
 CORNERS = 8  # of the outline of what is round
 FARTHEST = 1e5  # largest length, metres
 
-Length = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0.0, le=FARTHEST, allow_inf_nan=False)]
-Luminance = Annotated[float, Field(ge=0.0, le=1e9, allow_inf_nan=False)]
+Length = Annotated[float, Field(strict=True, ge=-FARTHEST, le=FARTHEST, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, gt=0.0, le=FARTHEST, allow_inf_nan=False)]
+Luminance = Annotated[float, Field(strict=True, ge=0.0, le=1e9, allow_inf_nan=False)]
+Illuminance = Annotated[float, Field(strict=True, gt=0.0, le=1e9, allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Bounds = tuple[Length, Length]
 
 
 class _Entry(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _is_convex(corners: Doubles) -> bool:
+    """Whether corners (K, 2), in turn, turn to one side only, and hold an area."""
+    edges = np.roll(corners, -1, axis=0) - corners
+    turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
+    least = float(turns.min())
+    most = float(turns.max())
+    rounding = 1e-9 * max(-least, most)
+    return rounding > 0.0 and (least >= -rounding or most <= rounding)
 
 
 class SolidEntry(_Entry):
@@ -40,6 +52,10 @@ class SolidEntry(_Entry):
             raise ValueError("expected either an outline, or a radius and the positions that it is at")
         if self.heights[0] >= self.heights[1]:
             raise ValueError("heights: expected the lower one first")
+        if not self.name.isprintable():
+            raise ValueError("name: expected a line of text, such as 'a house'")
+        if self.outline is not None and not _is_convex(np.array(self.outline)):
+            raise ValueError("outline: expected the corners of a convex outline in turn; split it into convex ones")
         return self
 
     def list_footprints(self) -> list[Footprint]:
@@ -85,7 +101,7 @@ class LightEntry(_Entry):
     """A light that the place may stand in."""
 
     map: Name  # an .hdr or .exr file in the folder, or the name of a bundled environment
-    lux: Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)] | None = None  # of level ground under open sky
+    lux: Illuminance | None = None  # of level ground under open sky
     variant: Name | None = None  # of the materials
 
 
