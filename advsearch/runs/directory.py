@@ -170,18 +170,21 @@ class RunDirectory:
 
     def _note_start(self, config: Config) -> None:
         """Note what decides the numbers of a new run."""
-        self.check_unchanged(BEGUN_WITH, config.deciding())
-        self.check_unchanged(summary.MADE_WITH, summary.made_with(_known_settings(config)))
         if config.only_here:
             self.store.set_note(ONLY_HERE, json.dumps(config.only_here))
+        self.check_unchanged(summary.MADE_WITH, summary.made_with(_known_settings(config)))
+        self.check_unchanged(BEGUN_WITH, config.deciding())  # last: with it the others are there, too
 
     def _check_same(self, config: Config) -> None:
         """Refuse settings, versions and files that decide other numbers than those that are stored."""
+        if self.store.note(BEGUN_WITH) is None:  # it was killed before anything was noted
+            if self.store.count():
+                raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got none")
+            self._note_start(config)
+            return
         read_again = {
             name: value for name, value in _known_settings(config).items() if name not in summary.NOT_READ_AGAIN
         }
-        if self.store.note(BEGUN_WITH) is None and self.store.count():
-            raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got none")
         self.check_unchanged(BEGUN_WITH, config.deciding())
         self.check_unchanged(summary.MADE_WITH, summary.made_with(read_again))
 

@@ -32,7 +32,7 @@ from advsearch.runs import files
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import can_resume
 from advsearch.runs.store import Row, Store, Told
-from advsearch.settings import Config
+from advsearch.settings import Config, PythonOnly
 
 POLICIES = ("pgd", "auto", "random", "cmaes")
 
@@ -301,3 +301,13 @@ def test_a_run_that_was_killed_before_it_had_results_goes_on(tmp_path: Path) -> 
     (tmp_path / "results.sqlite").replace(folder / "results.sqlite")
     with pytest.raises(RunExistsError):  # what somebody else made is not thrown away
         RunDirectory.create(folder)
+
+
+def test_a_run_that_was_killed_before_its_notes_knows_what_exists_only_in_python(tmp_path: Path) -> None:
+    config = configuration().with_only_here([PythonOnly("scene")])
+    with RunDirectory.create(tmp_path / "run", config=config):
+        pass
+    (tmp_path / "run" / "results.sqlite").unlink()
+    with RunDirectory.resume(tmp_path / "run", config):
+        pass
+    assert RunDirectory.read_python_only(tmp_path / "run") == [PythonOnly("scene")]

@@ -42,7 +42,7 @@ from advsearch.progress import NullProgress
 from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.sweep import job as swept_scene
 from advsearch.questions.sweep.axes import Points, axis_values, on_grid, parts_of_ranges, read_axes
-from advsearch.questions.sweep.carry_out import job_of, sweep_from_config
+from advsearch.questions.sweep.carry_out import _places, job_of, sweep_from_config
 from advsearch.questions.sweep.job import KIND
 from advsearch.questions.sweep.loop import Sweep
 from advsearch.questions.sweep.settings import SweepConfig
@@ -1170,3 +1170,10 @@ def test_rows_are_the_same_with_and_without_changed_pictures_really_rendered() -
     plain = advsearch.sweep("mug", "reference", {"pose.yaw": "0:360:4"}, **asked)
     changed = advsearch.sweep("mug", "reference", {"pose.yaw": "0:360:4"}, **asked, **CHANGES)
     assert [row.margin for row in changed.rows()] == [row.margin for row in plain.rows()]
+
+
+def test_a_sweep_of_settings_shows_the_scene_that_python_passed() -> None:
+    scene = advsearch.load_scene("mug")
+    config = SweepConfig(object="mug", environment="studio", controls={"pose": {}}, samples=2)
+    (place,) = _places(config.with_python_objects({("scene", "mug"): scene}))
+    assert place.scene is scene and (place.object, place.environment) == ("mug", "studio")

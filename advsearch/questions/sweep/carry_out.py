@@ -300,6 +300,9 @@ def _job(
 
 
 def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
+    passed: Scene | None = config.python_object(naming.SCENE, config.object)
+    if passed is not None:
+        return (NamedScene(config.object, passed.description.environment_name, passed),)
     objects = naming.different(config.objects, "object")
     environments = naming.different(config.environments, "environment")
     asked = environments[0] if config.environment else None
