@@ -187,14 +187,18 @@ WRONG: list[tuple[dict[str, object], type[InputError], str]] = [
     ({"lane_width": "3.5"}, FileFormatError, r"lane_width: Input should be a valid number"),
     ({"red\nhouse": 1}, FileFormatError, r"place.yaml: red\\nhouse: Extra inputs"),
     ({"lights": {"day": {"map": "black.exr", "lux": 5}}}, InputError, r"lights.day: expected a map with light for its"),
-    *[
-        ({"solids": [{"name": name, "outline": outline, "heights": [0, 1]}]}, FileFormatError, message)
-        for name, outline, message in (
-            ("a\nwall", [[0, 0], [1, 0], [1, 1]], r"solids.0: name: expected a line of text"),
-            ("a wall", [[0, 0], [1, 0], [2, 0]], r"solids.0: outline: expected the corners of a convex outline"),
-            ("a wall", [[0, 0], [4, 0], [4, 4], [2, 1], [0, 4]], r"outline: expected the corners of a convex"),
-        )
-    ],
+    (
+        {"solids": [{"name": "a\nwall", "outline": [[0, 0], [1, 0], [1, 1]], "heights": [0, 1]}]},
+        FileFormatError, r"solids.0: name: expected a line of text",
+    ),
+    (
+        {"solids": [{"name": "a wall", "outline": [[0, 0], [1, 0], [2, 0]], "heights": [0, 1]}]},
+        FileFormatError, r"solids.0: outline: expected the corners of a convex outline",
+    ),
+    (
+        {"solids": [{"name": "a wall", "outline": [[0, 0], [4, 0], [4, 4], [2, 1], [0, 4]], "heights": [0, 1]}]},
+        FileFormatError, r"outline: expected the corners of a convex",
+    ),
 ]  # fmt: skip
 
 
