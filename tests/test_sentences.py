@@ -32,11 +32,9 @@ LONGEST_VALUE = 3  # words of the value of a field such as `ending`: "already wr
 EXCEPTIONS = {
     "advsearch/api/keywords.py": "a docstring, to which a paragraph is added if it has not got it",
     "advsearch/attacks/objectives.py": "messages of torch and Python, which have no other mark",
-    "advsearch/models/labels.py": "not mended yet: the source of labels begins with what it is",
     "advsearch/questions/stability/scenes.py": "a case that checks the words of a message",
-    "advsearch/questions/stability/result.py": "not mended yet: names of measurements are grouped by their beginning",
+    "advsearch/questions/stability/result.py": "names of measurements are grouped by their beginning",
     "advsearch/runs/files.py": "a message of OpenEXR, which has no other mark",
-    "advsearch/scene/importing/gltf.py": "not mended yet: of two messages about a file the clearer one is shown",
     "advsearch/tasks/detector_outputs.py": "the words are the names of an output's columns, in their order",
     "advsearch/trust/writing.py": "messages of SQLite, which have no other mark",
 }

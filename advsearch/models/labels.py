@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from advsearch.errors import FileFormatError, InputError, resembling
 from advsearch.trust.stored_files import parse_json, read_text
@@ -187,12 +187,19 @@ def _lists_names(source: str | os.PathLike[str]) -> bool:
     return isinstance(source, str) and "," in text and not (os.path.isfile(text) or text.endswith((".json", ".txt")))
 
 
-def labels_origin(given: object) -> str:
-    """Return where labels came from, for messages."""
+class LabelsOrigin(NamedTuple):
+    """Where labels came from."""
+
+    text: str = "labels"  # for messages
+    is_file: bool = False
+
+
+def find_labels_origin(given: object) -> LabelsOrigin:
+    """Return where labels came from."""
     if given is None:
-        return "labels of the model"
+        return LabelsOrigin("labels of the model")
     is_file = isinstance(given, (str, os.PathLike)) and str(given) not in SETS and not _lists_names(given)
-    return f"label file {given}" if is_file else "labels"
+    return LabelsOrigin(f"label file {given}", is_file=True) if is_file else LabelsOrigin()
 
 
 def read_prompts(given: str | Sequence[str] | None) -> tuple[str, ...] | None:
@@ -227,18 +234,19 @@ def _label_sets() -> dict[str, tuple[str, ...]]:
     return {name: tuple(stored[name]) for name in SETS}
 
 
-def fitting_labels(classes: int, labels: tuple[str, ...] | None, source: str, model: str) -> tuple[str, ...]:
+def fitting_labels(classes: int, labels: tuple[str, ...] | None, origin: LabelsOrigin, model: str) -> tuple[str, ...]:
     """Return the labels, or placeholders for None; InputError (FileFormatError, for a file) if their number is not that
-    of a model's classes. The source, such as ``"label file x.json"``, is for the message."""
+    of a model's classes."""
     if labels is None:
         return tuple(f"class {index}" for index in range(classes))
     if len(labels) == classes:
         return labels
     message = (
-        f"{source}: {len(labels)} labels, but model {model} has {classes} classes; give one per class, in index order"
+        f"{origin.text}: {len(labels)} labels, but model {model} has {classes} classes; give one per class, in index "
+        "order"
         f"{''.join(f' (`labels={name}` has {classes})' for name in sets_of(classes))}"
     )
-    raise FileFormatError(message) if source.startswith("label file") else InputError(message)
+    raise FileFormatError(message) if origin.is_file else InputError(message)
 
 
 def _read_file(path: Path) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from advsearch.catalog import list_built_ins
 from advsearch.errors import InputError, ModelError, UnknownNameError, resembling
 from advsearch.models import files, reference
 from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
-from advsearch.models.labels import fitting_labels, labels_origin, names_in, read_labels, read_prompts
+from advsearch.models.labels import find_labels_origin, fitting_labels, names_in, read_labels, read_prompts
 from advsearch.models.model import PRESETS, Model, Preprocessing, Read, RemoteNetwork
 from advsearch.models.probe import probe
 from advsearch.models.source import Purpose, Source, load_callable, source_of, split_weights
@@ -99,7 +99,7 @@ def load_model(
     options |= {"layout": layout, "channels": channels, "max_batch": max_batch}
     given = {key: value for key, value in options.items() if value is not None}
     read = read or (task and task.reader)
-    names, origin = None if labels is None else read_labels(labels), labels_origin(labels)
+    names, origin = None if labels is None else read_labels(labels), find_labels_origin(labels)
     if names is not None and task and task.names_from:
         raise InputError(f"labels: the names of task {task.name} are those of {task.names_from}; leave `labels` out")
     prompts = read_prompts(prompt)  # first, because loading a model takes seconds

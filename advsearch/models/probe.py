@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from advsearch.errors import ModelError
 from advsearch.models.all_at_once import AllAtOnce
 from advsearch.models.inputs import EightBitInput, WithImageSize, WithState
-from advsearch.models.labels import fitting_labels
+from advsearch.models.labels import LabelsOrigin, fitting_labels
 from advsearch.models.model import PROGRAMS, Detaching, Model, logits_of, read_by, tensors_in, warn
 from advsearch.trust.foreign_code import TookTooLong, first_line, within
 from advsearch.trust.stored_files import FACTOR, scaled
@@ -55,7 +55,7 @@ SMALLEST = 1e-5  # smallest change that is looked at, as a share of the outputs:
 LARGEST = 1 << 26  # pixels of all the images that a network takes at once, at least: 800 MB of numbers
 
 
-def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> Model:
+def probe(model: Model, labels: tuple[str, ...] | None, labels_origin: LabelsOrigin) -> Model:
     """Return the model with `labels`, `probabilities`, `differentiable` and `batch_limits` set from what it does. There
     are labels for each class, or None for placeholders ("class 0"); where they came from is for messages.
 
@@ -91,7 +91,7 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
             f"model {model.name}: expected finite {what}, got NaN or infinity for a {which} image; "
             "check its weights and the value range and normalisation that it expects"
         )
-    names = fitting_labels(rows.shape[1], labels, labels_source, model.name) if logits else labels or ()
+    names = fitting_labels(rows.shape[1], labels, labels_origin, model.name) if logits else labels or ()
     percentages = logits and _probabilities(rows / 100.0, PERCENT_TOLERANCE)
     probabilities = logits and (percentages or _probabilities(rows))
     if probabilities:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 
 from advsearch.errors import ModelError
+from advsearch.models.labels import LabelsOrigin
 from advsearch.models.model import Model, Preprocessing
 from advsearch.models.probe import probe
 from advsearch.models.source import frozen, load_weights
@@ -122,7 +123,7 @@ def load(folder: Path | None = None, weights: Path | None = None) -> Model:
         frozen(folded(net), name), name, (), Preprocessing(INPUT_SIZE),
         make_trainable=lambda: network(folder, weights)[0],  # `folded` has merged its normalisation
     )  # fmt: skip
-    return probe(bare, labels, "labels of the reference model")
+    return probe(bare, labels, LabelsOrigin("labels of the reference model"))
 
 
 def network(folder: Path | None = None, weights: Path | None = None) -> tuple[ReferenceNet, tuple[str, ...]]:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.models import Model, find_label_set
-from advsearch.models.labels import fitting_labels, names_nothing
+from advsearch.models.labels import LabelsOrigin, fitting_labels, names_nothing
 from advsearch.options import FROM_RUN, NOT_A_NUMBER
 from advsearch.tasks.base import Facts, Judgement, Output, Prediction, Task
 
@@ -61,7 +61,7 @@ class ClassTask(Task):
         if count is None and given is None:
             raise InputError(f"labels: expected a file with the names of the classes of model {model.name}, got none")
         return (
-            model.labels if count is None else fitting_labels(count, given, "labels", model.name)
+            model.labels if count is None else fitting_labels(count, given, LabelsOrigin(), model.name)
         ), given is not None
 
     def classes_in(self, output: Output) -> int | None:

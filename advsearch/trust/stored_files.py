@@ -136,6 +136,10 @@ def parsed(path: Path | str, text: str, kind: str, parse: Callable[[str], Any]) 
         raise FileFormatError(f"{path}: expected {kind}, got {error}; correct the file") from None
 
 
+class JsonBoundsError(ValueError):
+    """A JSON text is nested too deep, or has a number that is too long."""
+
+
 def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
     """Return the value of a JSON text. Raises ValueError where it is not JSON, is nested deeper than `DEPTH`, or has a
     number of thousands of digits; with `finite` also where one is NaN or infinite. The message is short."""
@@ -143,9 +147,9 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
     try:
         value = json.loads(text, parse_int=_whole_number, parse_float=number, parse_constant=number)
     except RecursionError:
-        raise ValueError(f"lists or objects nested deeper than {DEPTH}") from None
+        raise JsonBoundsError(f"lists or objects nested deeper than {DEPTH}") from None
     if not is_shallow(value, DEPTH - 1):
-        raise ValueError(f"lists or objects nested deeper than {DEPTH}")
+        raise JsonBoundsError(f"lists or objects nested deeper than {DEPTH}")
     return value
 
 
@@ -157,7 +161,7 @@ def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
 
 def _whole_number(text: str) -> int:
     if len(text) > DIGITS:
-        raise ValueError(f"a whole number of {len(text)} digits")
+        raise JsonBoundsError(f"a whole number of {len(text)} digits")
     return int(text)
 
 

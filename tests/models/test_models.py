@@ -32,7 +32,7 @@ from advsearch.models import (
     read_labels,
     reference,
 )
-from advsearch.models.labels import fitting_labels, sets_of
+from advsearch.models.labels import LabelsOrigin, fitting_labels, sets_of
 from advsearch.tasks import make_task
 
 DATA = conftest.DATA / "models"
@@ -748,8 +748,8 @@ def test_a_count_of_labels_that_is_that_of_a_data_set_names_it() -> None:
     for count, name in ((90, "coco90"), (91, "coco91"), (21, "voc")):
         assert sets_of(count) == [name]
         with pytest.raises(InputError, match=rf"labels: 80 labels, .* in index order \(`labels={name}` has {count}\)$"):
-            fitting_labels(count, read_labels("coco"), "labels", "net")
-        unnamed = fitting_labels(count, None, "labels", "net")
+            fitting_labels(count, read_labels("coco"), LabelsOrigin(), "net")
+        unnamed = fitting_labels(count, None, LabelsOrigin(), "net")
         with pytest.raises(InputError, match=rf"give a label file \(`labels`\) or `labels={name}`, or an index"):
             find_label_set("mug", unnamed, named=False)
     assert sets_of(3) == []

@@ -158,11 +158,15 @@ def damaged(path: Path | str, expected: str, got: str) -> FileFormatError:
     return FileFormatError(f"{path}: expected {expected}, got {got}; export or download the file again")
 
 
+def find_kind(data: bytes) -> str | None:
+    """Return the kind of file that `data` begins like, in words that fit after "got"; None for an unknown one."""
+    return next((kind for magic, kind in _KINDS if data.startswith(magic)), None)
+
+
 def looks_like(data: bytes) -> str:
     """Name the kind of file that `data` begins like, in words that fit after "got"."""
-    for magic, kind in _KINDS:
-        if data.startswith(magic):
-            return kind
+    if (kind := find_kind(data)) is not None:
+        return kind
     return "binary data of another kind" if b"\x00" in data else "text of another kind"
 
 

@@ -17,10 +17,10 @@ from pydantic import ValidationError
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue
 from advsearch.scene.assets import Doubles, Ints
-from advsearch.scene.importing.files import SPLATS, check_faces, damaged, looks_like, shown, text_of
+from advsearch.scene.importing.files import SPLATS, check_faces, damaged, find_kind, looks_like, shown, text_of
 from advsearch.scene.importing.gltf_entries import Asset, Entry, Header, Primitive
 from advsearch.trust.named_files import References, plain_name
-from advsearch.trust.stored_files import check_most, parse_json
+from advsearch.trust.stored_files import JsonBoundsError, check_most, parse_json
 
 MOST_VALUES = 1_000_000
 """Lists, objects and values in a header; each takes hundreds of bytes of memory, and may take two of the file."""
@@ -36,10 +36,8 @@ def read_header(path: Path, data: bytes) -> Header:
     try:
         content = parse_json(text)
     except ValueError as error:
-        kind, reason = looks_like(chunk), str(error)
-        if "another kind" in kind:
-            kind = reason if reason.startswith(("a whole", "lists or")) else "something else"
-        raise damaged(path, "glTF with a JSON header", kind) from None
+        otherwise = str(error) if isinstance(error, JsonBoundsError) else "something else"
+        raise damaged(path, "glTF with a JSON header", find_kind(chunk) or otherwise) from None
     if not isinstance(content, dict) or "asset" not in content:
         raise damaged(path, "glTF with an 'asset' entry", "other JSON")
     try:
