@@ -34,6 +34,7 @@ from advsearch.files import split_paths
 from advsearch.registry import imported
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 from advsearch.trust.code import allow_code
+from advsearch.trust.named_files import is_inside
 
 PACKAGES = ("mitsuba", "drjit", "torch", "numpy")  # whose versions decide last bits
 
@@ -71,9 +72,11 @@ WITH_OTHERS = {
     ".obj": (".mtl",),
     ".gltf": (".bin",),
     ".xml": (".obj", ".ply", ".serialized", ".exr", ".hdr"),
-    **dict.fromkeys((".yaml", ".yml"), (".glb", ".gltf", ".bin", ".exr", ".hdr")),  # of a place
 }
 """Files that name others, and what these end in beside pictures."""
+
+OF_A_PLACE = (".glb", ".gltf", ".bin", ".exr", ".hdr")
+"""What files end in that the YAML file of a place may name, beside pictures."""
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff")
 
@@ -87,14 +90,17 @@ class MissingFilesError(Exception):
 def read_files(task: WorkerTask) -> dict[str, bytes]:
     """Read the files that a task's settings name, and those beside them, by their paths."""
     contents: dict[str, bytes] = {}
-    for value in map(task.settings.get, task.files):
+    for name in task.files:
+        value = task.settings.get(name)
         for part in _split(value) if isinstance(value, str) else ():
             path = Path(part)
             if path.is_absolute() and path.is_file():
-                kinds = WITH_OTHERS.get(path.suffix.lower(), ())
+                is_place = name == "environment" and path.suffix.lower() in (".yaml", ".yml")
+                kinds = OF_A_PLACE if is_place else WITH_OTHERS.get(path.suffix.lower(), ())
                 others = sorted(path.parent.rglob("*")) if kinds else []
                 beside = [file for file in others if file.suffix.lower() in (*kinds, *PICTURES) and file.is_file()]
-                contents |= {str(file): file.read_bytes() for file in (path, *beside)}
+                inside = [file for file in beside if is_inside(file, path.parent)]  # no link leads elsewhere
+                contents |= {str(file): file.read_bytes() for file in (path, *inside)}
     size = sum(map(len, contents.values()))
     if size > LARGEST:
         raise InputError(

@@ -192,6 +192,20 @@ def test_files_of_lists_nodes_and_two_paths_are_read_here_and_found_there(tmp_pa
     assert Path(paths[2].partition("#")[0]).read_text() == "two+cups.glb" and paths[0].endswith("mug.glb#Cup")
 
 
+def test_of_a_folder_a_place_alone_sends_its_neighbours_and_no_link_leads_out(tmp_path: Path) -> None:
+    here, private = tmp_path / "here", tmp_path / "private.png"
+    here.mkdir()
+    for name in ("place.yaml", "street.glb", "holiday.png", "notes.txt"):
+        (here / name).write_text(name)
+    private.write_text("private")
+    (here / "link.png").symlink_to(private)
+    yaml = f"{here}/place.yaml"
+    place = read_files(WorkerTask("a:b", {"environment": f"{yaml}#night"}, ("environment",)))
+    assert {Path(path).name for path in place} == {"place.yaml", "street.glb", "holiday.png"}
+    camera = read_files(WorkerTask("a:b", {"camera": yaml}, ("camera",)))
+    assert {Path(path).name for path in camera} == {"place.yaml"}
+
+
 def test_runs_that_share_a_worker_all_get_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """More of them than tasks that a worker keeps loaded: each batch finds its task loaded again."""
     monkeypatch.setattr(worker_module, "_loaded", type(worker_module._loaded)())
