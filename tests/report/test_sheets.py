@@ -170,7 +170,7 @@ def test_the_command_writes_a_pdf_and_says_what_it_needs(
     assert main(["export", run, "--format", "print", "--out", str(tmp_path / "usual.pdf"), "--json"]) == 0
     own = json.loads(capsys.readouterr().out)
     assert own["size_mm"] == pytest.approx(109.5, abs=0.1)
-    monkeypatch.setattr("advsearch.api.export.real_size", lambda run: None)  # of a file without a unit
+    monkeypatch.setattr("advsearch.api.exports.real_size", lambda run: None)  # of a file without a unit
     assert main(["export", run, "--format", "print", "--out", str(tmp_path / "unknown.pdf")]) == 0
     assert "longest side is taken for 100 mm; --size says otherwise" in capsys.readouterr().err
     for wrong, message in (
