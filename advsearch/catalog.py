@@ -304,7 +304,7 @@ BUILT_INS = (
         "the adversarial object as glTF",
     ),
     BuiltIn(
-        "exporter", "mitsuba", f"{_EXPORTERS}.scene:MitsubaScene",
+        "exporter", "mitsuba", f"{_EXPORTERS}.scene:MitsubaExport",
         "the adversarial scene for Mitsuba",
     ),
     BuiltIn(

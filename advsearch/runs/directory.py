@@ -225,16 +225,6 @@ class RunDirectory:
             self._tracker.rows(rows)
 
     @staticmethod
-    def digest_files(values: Mapping[str, Any]) -> dict[str, str]:
-        """Return the SHA-256 of each file that settings name, and of each that was read for it, in hexadecimal."""
-        return summary.file_digests(values)
-
-    @staticmethod
-    def find_changed_file(before: Mapping[str, object], values: Mapping[str, Any]) -> str | None:
-        """Return the name of a file that settings name and whose digest is another one than before, or None."""
-        return summary.changed_file(before, values)
-
-    @staticmethod
     def find_file_changed_since(run: Path, config: Config) -> str | None:
         """Return the name of a file that settings name and that is another one than when a run was made, or None."""
         return summary.changed_file(RunDirectory.read_made_with(run), config.plain())
@@ -246,19 +236,9 @@ class RunDirectory:
             noted = results.noted(summary.MADE_WITH)
         return noted if isinstance(noted, dict) else {}
 
-    @staticmethod
-    def read_python_only(run: str | Path) -> list[PythonOnly]:
-        """Return the parts of a run that existed only in the Python session that made it."""
-        return read_python_only(Path(run))
-
     def record_row(self, kind: str, step: int, **columns: Any) -> None:
         """Add one evaluated configuration to the results; `columns` are those of `store.Row`."""
         self.record(store.Row(kind, step, **columns))
-
-    @staticmethod
-    def locate_config(run: Path) -> Path:
-        """Return the file of the settings of a run."""
-        return run / CONFIG
 
     @staticmethod
     def locate_part(run: Path, name: str) -> Path:

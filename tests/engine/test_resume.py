@@ -29,7 +29,7 @@ from advsearch.questions.attack.settings import AttackConfig
 from advsearch.questions.check.result import CheckConfig
 from advsearch.questions.stability.result import StabilityConfig
 from advsearch.runs import files
-from advsearch.runs.directory import RunDirectory
+from advsearch.runs.directory import RunDirectory, read_python_only
 from advsearch.runs.listing import can_resume
 from advsearch.runs.store import Row, Store, Told
 from advsearch.settings import Config, PythonOnly
@@ -310,4 +310,4 @@ def test_a_run_that_was_killed_before_its_notes_knows_what_exists_only_in_python
     (tmp_path / "run" / "results.sqlite").unlink()
     with RunDirectory.resume(tmp_path / "run", config):
         pass
-    assert RunDirectory.read_python_only(tmp_path / "run") == [PythonOnly("scene")]
+    assert read_python_only(tmp_path / "run") == [PythonOnly("scene")]

@@ -62,7 +62,7 @@ def find_region(context: RunContext[RegionConfig]) -> RegionResult:
     stages.begin("setup", workbench.LOADING)
     budget: dict[str, object] = {}
     if config.around is not None:  # its centre has to lie within
-        attack_config = AttackConfig.from_yaml(RunDirectory.locate_config(directory.find_run(config.around)))
+        attack_config = AttackConfig.from_yaml(directory.find_run(config.around) / directory.CONFIG)
         budget = {"epsilon": attack_config.epsilon, "norm": attack_config.norm}
     problem, warnings = workbench.problem_from_config(AttackConfig.of(config, **budget))
     for text in warnings:

@@ -143,7 +143,9 @@ def replay(attack: str | Path | AttackResult, *, progress: Watched = None, **opt
         if attack.run is None:
             raise InputError("attack: expected an attack that was kept, got one that was not; give it a `run`")
         run = attack.run
-        only_now = [part for part in RunDirectory.read_python_only(run) if part.role not in workbench.ROLES_IN_SEARCH]
+        only_now = [
+            part for part in directory.read_python_only(Path(run)) if part.role not in workbench.ROLES_IN_SEARCH
+        ]
         parts = None if attack.parts is None else attack.parts()
     config = workbench.configured(ReplayConfig, attack=run, **options)
     config = config.with_only_here(only_now) if only_now else config

@@ -161,7 +161,7 @@ class Counterexample:
 
     def changed_file(self, config: AttackConfig) -> str | None:
         """Return the name of a file that its settings name and that is another one now; None where all are the same."""
-        return RunDirectory.find_changed_file(self.files, deciding_settings(config))
+        return directory.summary.changed_file(self.files, deciding_settings(config))
 
     def configuration(self, start: Tensor) -> Tensor:
         if start.numel() != len(self.moved):
@@ -264,7 +264,7 @@ def add(suite: str, run: str) -> Counterexample:
     kept = {name: value for name, value in config.plain().items() if name not in NOT_DECIDING}
     values: dict[str, Any] = {"schema": 1, "run": path.name, "said": next(iter(summary.verified.labels), "")}
     values["settings"] = relative_to_here(kept)
-    values["files"] = RunDirectory.digest_files(relative_to_here(deciding_settings(config)))
+    values["files"] = directory.summary.file_digests(relative_to_here(deciding_settings(config)))
     values |= {"scene": scene_digest(parts.scene.description), "spp": summary.verified.spp}
     folder.mkdir(parents=True, exist_ok=True)
     writing.write_bytes(folder / f"{name}{PICTURE}", _make_thumbnail(path / "images" / "adversarial.png"))

@@ -97,7 +97,7 @@ class PictureEntry(_Entry):
         return self
 
 
-class LightEntry(_Entry):
+class PlaceLight(_Entry):
     """A light that the place may stand in."""
 
     map: Name  # an .hdr or .exr file in the folder, or the name of a bundled environment
@@ -110,7 +110,7 @@ class PlaceFile(_Entry):
 
     mesh: Name  # a .glb or .gltf file in the folder
     ground: Annotated[list[Name], Field(min_length=1, max_length=64)]  # meshes that things stand on
-    lights: Annotated[dict[Name, LightEntry], Field(min_length=1, max_length=64)]  # the first is taken by itself
+    lights: Annotated[dict[Name, PlaceLight], Field(min_length=1, max_length=64)]  # the first is taken by itself
     lane_width: Positive | None = None  # of the lane that the object drives in; None: there is none
     floor: Length = 0.0  # height of the floor that cameras stand on, where the object stands on something
     lamps: Annotated[dict[Name, tuple[Luminance, Luminance, Luminance]], Field(max_length=64)] = {}

@@ -24,7 +24,7 @@ class Gltf(Exporter):
         return Exported({"notes": notes}, " ".join([f"The object is in {out}.", *notes]))
 
 
-class MitsubaScene(Exporter):
+class MitsubaExport(Exporter):
     """The adversarial scene for Mitsuba."""
 
     name = "mitsuba"
